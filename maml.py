@@ -1,0 +1,109 @@
+"""Model-agnostic meta-learning (MAML) with second-order gradients, for any loss.
+
+    inner loop    theta'_i = theta - alpha * grad_theta L(theta, support_i)               (Eq. 2)
+    outer loop    g = grad_theta 1/|tasks| * sum_i L(theta'_i(theta), query_i)            (Eq. 3)
+
+The outer gradient runs *through* the inner step: theta'_i depends on theta twice, once directly and once through the
+support gradient, so g contains the second derivatives of the support loss. `torch.func.grad` gives this by
+construction, because a gradient is a function like any other and can be differentiated again.
+
+Nothing here knows what a policy is. A model enters as `params`, a dictionary of tensors, and a function
+`loss_fn(params, batch) -> scalar tensor`; with a `torch.nn.Module` that is
+
+    def loss_fn(params, batch):
+        return torch.func.functional_call(module, params, (), batch)      # batch: keyword arguments of module.forward
+
+`loss_fn` must be pure: random numbers (diffusion noise, dropout masks) belong in `batch`.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import grad, grad_and_value, vmap
+from torch.utils._pytree import tree_map
+
+Params = dict[str, Tensor]
+LossFn = Callable[[Params, Any], Tensor]
+
+
+def adapt(loss_fn: LossFn, params: Params, batch: Any, lr: float, steps: int = 1, first_order: bool = False) -> Params:
+    """Takes `steps` steps of gradient descent on one batch and returns the adapted parameters (Eq. 2).
+
+    The result is a differentiable function of `params`; the input is not modified.
+
+    Args:
+        loss_fn: `(params, batch) -> ()`, pure.
+        params: name -> tensor, the initialisation theta.
+        batch: anything `loss_fn` understands, usually the support set of a task.
+        lr: the inner learning rate alpha.
+        steps: gradient steps, all on the same batch.
+        first_order: treat the inner gradient as a constant, so that who differentiates the result sees
+            d theta' / d theta = 1. Cheaper, and a different gradient.
+
+    Returns:
+        name -> tensor, theta'.
+    """
+    for _ in range(steps):
+        start = {name: p.detach() for name, p in params.items()} if first_order else params
+        gradient = grad(loss_fn)(start, batch)
+        params = {name: p - lr * gradient[name] for name, p in params.items()}
+    return params
+
+
+def meta_gradient(
+    loss_fn: LossFn,
+    params: Params,
+    tasks: Iterable[tuple[Any, Any]],
+    lr: float,
+    steps: int = 1,
+    first_order: bool = False,
+    vectorize: bool = False,
+) -> tuple[Params, Tensor]:
+    """Mean query loss over tasks, differentiated through each task's inner loop (Eq. 3; Algorithm 1, lines 4-19).
+
+    Args:
+        loss_fn: `(params, batch) -> ()`, pure.
+        params: name -> tensor, the initialisation theta.
+        tasks: (support, query) batches, one pair a task. An iterator is read one task at a time, and the graph of a
+            task is freed before the next is read: memory does not grow with the number of tasks.
+        lr, steps, first_order: as in `adapt`.
+        vectorize: run all tasks at once under `torch.vmap`. The same numbers, faster on a GPU, with memory for
+            all tasks; the batches of all tasks must have equal shapes and hold tensors only.
+
+    Returns:
+        (gradients, losses): name -> tensor, and the query losses after adaptation, (tasks,), detached.
+
+    Raises:
+        ValueError: `tasks` is empty.
+    """
+
+    # Parameters that require grad would make autograd record all of this once more, beneath torch.func.
+    params = {name: p.detach() for name, p in params.items()}
+
+    def query_loss(params: Params, support: Any, query: Any) -> Tensor:
+        adapted = adapt(loss_fn, params, support, lr, steps, first_order)
+        return loss_fn(adapted, query)
+
+    if vectorize:
+        tasks = list(tasks)
+        if not tasks:
+            raise ValueError("meta_gradient needs at least one task")
+        support, query = tree_map(lambda *leaves: torch.stack(leaves), *tasks)
+
+        def mean_query_loss(params: Params) -> tuple[Tensor, Tensor]:
+            losses = vmap(query_loss, in_dims=(None, 0, 0))(params, support, query)  # (tasks,)
+            return losses.mean(), losses
+
+        gradients, (_, losses) = grad_and_value(mean_query_loss, has_aux=True)(params)
+        return gradients, losses.detach()
+
+    total, losses = None, []
+    for support, query in tasks:
+        gradients, loss = grad_and_value(query_loss)(params, support, query)
+        total = gradients if total is None else {name: total[name].add_(g) for name, g in gradients.items()}
+        losses.append(loss.detach())
+    if total is None:
+        raise ValueError("meta_gradient needs at least one task")
+    return {name: g / len(losses) for name, g in total.items()}, torch.stack(losses)

@@ -1,0 +1,209 @@
+"""Tests of maml.py against finite differences, torch.optim, a closed form, and on the real (tiny) policy."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.func import functional_call, grad
+from torch.multiprocessing.reductions import StorageWeakRef
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from maml import adapt, meta_gradient
+from model import PRESETS, DAMIPolicy
+
+
+class Setting:
+    """The tiny policy in float64, its loss as a function of its parameters, and three tasks of random windows."""
+
+    def __init__(self, **changes):
+        torch.manual_seed(0)
+        self.policy = DAMIPolicy(replace(PRESETS["tiny"], num_points=16, demo_positions=4, **changes)).double()
+        self.params = dict(self.policy.named_parameters())
+        self.tasks = [(self.batch(2 * i, 4), self.batch(2 * i + 1, 6)) for i in range(3)]
+
+    def loss(self, params, batch):
+        return functional_call(self.policy, params, (), batch)
+
+    def batch(self, seed, windows):
+        config, g = self.policy.config, torch.Generator().manual_seed(seed)
+        draw = lambda *shape: torch.randn(shape, generator=g, dtype=torch.float64)  # noqa: E731
+        return {
+            "points": draw(windows, 2, config.num_points, 3),
+            "state": draw(windows, 2, config.state_dim),
+            "action": draw(windows, config.horizon, config.action_dim),
+            "text": draw(1, config.text_dim),
+            "demo_points": draw(1, 4, config.num_points, 3),
+            "demo_state": draw(1, 4, config.state_dim),
+            "demo_action": draw(1, 4, config.action_dim),
+            "noise": draw(windows, config.horizon, config.action_dim),
+            "timesteps": torch.randint(config.diffusion_steps, (windows,), generator=g),
+        }
+
+
+@pytest.fixture(scope="module")
+def setting():
+    return Setting()
+
+
+def flat(params):
+    return torch.cat([p.detach().flatten() for p in params.values()])
+
+
+def unflat(vector, like):
+    parts = vector.split([p.numel() for p in like.values()])
+    return {name: part.view_as(p) for (name, p), part in zip(like.items(), parts)}
+
+
+def objective(setting, vector, lr, steps):
+    """The mean query loss after adaptation, by plain autograd: no torch.func, no graph through the inner loop."""
+    total = 0.0
+    for support, query in setting.tasks:
+        params = unflat(vector, setting.params)
+        for _ in range(steps):
+            leaves = {name: p.detach().requires_grad_() for name, p in params.items()}
+            gradients = torch.autograd.grad(setting.loss(leaves, support), list(leaves.values()))
+            params = {name: p.detach() - lr * g for (name, p), g in zip(leaves.items(), gradients)}
+        with torch.no_grad():
+            total += setting.loss(params, query).item() / len(setting.tasks)
+    return total
+
+
+# --- The gradient through the inner loop -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("steps, lr", [(1, 0.3), (3, 0.1)])
+@pytest.mark.parametrize("vectorize", [False, True])
+def test_the_meta_gradient_of_the_policy_equals_finite_differences_and_first_order_does_not(
+    setting, steps, lr, vectorize
+):
+    run = lambda **options: flat(meta_gradient(setting.loss, setting.params, setting.tasks, lr, steps, **options)[0])  # noqa: E731
+    second, first = run(vectorize=vectorize), run(first_order=True, vectorize=vectorize)
+    start = flat(setting.params)
+    torch.manual_seed(1)
+    # Along their difference the two disagree most; random directions see all parameters.
+    for direction in (second - first, torch.randn_like(start), torch.randn_like(start)):
+        direction = direction / direction.norm()
+        h = 1e-6  # short, so that hardly ever a ReLU or a maximum switches in between
+        slope = objective(setting, start + h * direction, lr, steps) - objective(setting, start - h * direction, lr, steps)
+        slope = slope / (2 * h)
+        assert float(second @ direction) == pytest.approx(slope, rel=1e-5, abs=1e-8)
+    print((second - first).norm() / first.norm())
+    assert (second - first).norm() > 0.3 * first.norm()
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+@pytest.mark.parametrize("vectorize", [False, True])
+def test_the_meta_gradient_of_quadratics_has_its_closed_form(steps, vectorize):
+    torch.manual_seed(0)
+    lr, theta = 0.2, torch.randn(5, dtype=torch.float64)
+
+    def quadratic():
+        root = torch.randn(5, 5, dtype=torch.float64)
+        return root @ root.T / 5, torch.randn(5, dtype=torch.float64)
+
+    loss = lambda params, batch: 0.5 * params["x"] @ batch[0] @ params["x"] - batch[1] @ params["x"]  # noqa: E731
+    tasks = [(quadratic(), quadratic()) for _ in range(3)]
+    second, first, losses = torch.zeros(5).double(), torch.zeros(5).double(), []
+    for (a, b), (c, d) in tasks:
+        adapted, jacobian = theta, torch.eye(5, dtype=torch.float64)
+        for _ in range(steps):
+            adapted, jacobian = adapted - lr * (a @ adapted - b), (torch.eye(5) - lr * a) @ jacobian
+        first += (c @ adapted - d) / 3
+        second += jacobian.T @ (c @ adapted - d) / 3
+        losses.append(0.5 * adapted @ c @ adapted - d @ adapted)
+    for expected, first_order in ((second, False), (first, True)):
+        gradient, values = meta_gradient(loss, {"x": theta}, tasks, lr, steps, first_order, vectorize)
+        torch.testing.assert_close(gradient["x"], expected)
+        torch.testing.assert_close(values, torch.stack(losses))
+    assert (second - first).norm() > 0.1 * first.norm()
+
+
+@pytest.mark.parametrize("first_order", [False, True])
+@pytest.mark.parametrize("steps", [1, 2])
+def test_one_task_after_another_equals_all_tasks_under_vmap(setting, steps, first_order):
+    runs = [
+        meta_gradient(setting.loss, setting.params, setting.tasks, 0.1, steps, first_order, vectorize)
+        for vectorize in (False, True)
+    ]
+    (loop, losses), (vectorized, values) = runs
+    torch.testing.assert_close(losses, values)
+    assert losses.shape == (3,) and losses.std() > 1e-3
+    assert list(loop) == list(vectorized) == list(setting.params)
+    for name in loop:
+        torch.testing.assert_close(loop[name], vectorized[name], atol=1e-10, rtol=1e-8)
+
+
+def test_first_order_is_the_query_gradient_at_the_adapted_parameters(setting):
+    gradient, _ = meta_gradient(setting.loss, setting.params, setting.tasks[:1], 0.1, 2, first_order=True)
+    support, query = setting.tasks[0]
+    adapted = {name: p.detach() for name, p in adapt(setting.loss, setting.params, support, 0.1, 2).items()}
+    torch.testing.assert_close(flat(gradient), flat(grad(setting.loss)(adapted, query)))
+
+
+@pytest.mark.parametrize("first_order", [False, True])
+def test_adapting_takes_the_steps_of_torchs_sgd_and_leaves_its_input(setting, first_order):
+    support = setting.tasks[0][0]
+    before = flat(setting.params)
+    adapted = adapt(setting.loss, setting.params, support, 0.1, 3, first_order)
+    torch.testing.assert_close(flat(setting.params), before, atol=0, rtol=0)
+    peer = Setting().policy
+    optimizer = torch.optim.SGD(peer.parameters(), lr=0.1)
+    for _ in range(3):
+        optimizer.zero_grad()
+        peer(**support).backward()
+        optimizer.step()
+    torch.testing.assert_close(flat(adapted), flat(dict(peer.named_parameters())))
+    assert (flat(adapted) - before).abs().max() > 1e-3
+
+
+def test_without_tasks_there_is_no_meta_gradient():
+    for vectorize in (False, True):
+        with pytest.raises(ValueError, match="at least one task"):
+            meta_gradient(lambda params, batch: params["x"].sum(), {"x": torch.ones(1)}, iter([]), 0.1, vectorize=vectorize)
+
+
+# --- Memory ----------------------------------------------------------------------------------------------------------
+
+
+class Storages(TorchDispatchMode):
+    """Keeps account of the memory behind every tensor that any operation makes, the ones only autograd holds too."""
+
+    def __init__(self):
+        super().__init__()
+        self.made = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for x in tree_leaves(out):
+            if isinstance(x, torch.Tensor):
+                self.made.append((StorageWeakRef(x.untyped_storage()), x.untyped_storage().nbytes()))
+        return out
+
+    def alive(self):
+        return sum({ref.cdata: size for ref, size in self.made if not ref.expired()}.values())
+
+
+def test_memory_does_not_grow_with_the_number_of_tasks(setting):
+    alive = []
+    with Storages() as storages:
+
+        def tasks():
+            for i in range(5):
+                alive.append(storages.alive())  # what is left of the tasks so far
+                yield setting.batch(2 * i, 4), setting.batch(2 * i + 1, 6)
+
+        gradients, losses = meta_gradient(setting.loss, setting.params, tasks(), 0.1)
+    assert len(losses) == 5 and max(size for _, size in storages.made) > 1000
+    parameters = sum(p.numel() for p in setting.params.values()) * 8
+    assert max(alive) < 3.5 * parameters  # the sum, one task's gradients, one task's batch; no graph
+    assert max(alive[3:]) - alive[2] < 0.02 * parameters
+
+
+def test_the_result_carries_no_graph_although_the_parameters_require_grad(setting):
+    for vectorize in (False, True):
+        gradients, losses = meta_gradient(setting.loss, setting.params, setting.tasks, 0.1, vectorize=vectorize)
+        assert all(p.requires_grad for p in setting.params.values())
+        assert not losses.requires_grad and not any(g.requires_grad for g in gradients.values())
+    assert math.isfinite(losses.sum())

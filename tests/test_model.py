@@ -1,0 +1,441 @@
+"""Tests of model.py (its CLIP part is in test_clip.py) against diffusers, naive computations and real demonstrations."""
+
+import ast
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from diffusers import DDIMScheduler
+from diffusers.models.embeddings import get_timestep_embedding
+
+import data
+import model
+from evaluate import window_sampler
+from model import PRESETS, DAMIPolicy, DiffusionSchedule, InputError, Normalizer, PolicyConfig
+
+TINY = PRESETS["tiny"]
+ABLATIONS = [("vmt", "down"), ("vmt", "mid"), ("vmt", "up"), ("mlp", "down"), ("none", "down"), ("none", "none")]
+
+
+def new_policy(seed=0, **changes):
+    torch.manual_seed(seed)
+    return DAMIPolicy(replace(TINY, **changes)).eval()
+
+
+def random_batch(config, windows=6, tasks=1, frames=10, seed=0):
+    """Random arguments of `DAMIPolicy.loss`."""
+    g = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(shape, generator=g)  # noqa: E731
+    return {
+        "points": draw(windows, config.n_obs_steps, config.num_points, 3),
+        "state": draw(windows, config.n_obs_steps, config.state_dim),
+        "action": draw(windows, config.horizon, config.action_dim),
+        "text": draw(tasks, config.text_dim),
+        "demo_points": draw(tasks, frames, config.num_points, 3),
+        "demo_state": draw(tasks, frames, config.state_dim),
+        "demo_action": draw(tasks, frames, config.action_dim),
+        "noise": draw(windows, config.horizon, config.action_dim),
+        "timesteps": torch.randint(config.diffusion_steps, (windows,), generator=g),
+    }
+
+
+def context_of(policy, batch, task=slice(None)):
+    return policy.encode_demo(*(batch[name][task] for name in ("text", "demo_points", "demo_state", "demo_action")))
+
+
+def sample(policy, batch, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return policy.sample_actions(batch["points"], batch["state"], context_of(policy, batch), generator)
+
+
+# --- Configuration ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes, numbers",
+    [
+        ({"n_action_steps": 16}, ("16", "15", "2")),
+        ({"horizon": 18}, ("18", "4")),
+        ({"inference_steps": 7}, ("100", "7")),
+        ({"demo_dim": 130}, ("130", "4")),
+        ({"u2t_heads": 7}, ("384", "7")),
+        ({"unet_widths": (512, 1020, 2048)}, ("1020", "8")),
+        ({"tcfm": "none"}, ("tcfm", "demo_encoder")),
+        ({"demo_encoder": "lstm"}, ("lstm", "vmt")),
+        ({"tcfm": "left"}, ("left", "mid")),
+    ],
+)
+def test_a_config_that_contradicts_itself_is_refused_naming_both_values(changes, numbers):
+    with pytest.raises(InputError) as error:
+        PolicyConfig(**changes)
+    assert all(number in str(error.value) for number in numbers) and "\n" not in str(error.value)
+
+
+def test_the_paper_preset_has_the_papers_size_and_condition_width():
+    with torch.device("meta"):
+        policy = DAMIPolicy(PRESETS["paper"])
+    assert 255e6 < sum(p.numel() for p in policy.parameters()) < 260e6
+    assert policy.config.condition_dim == 384
+
+
+@pytest.mark.parametrize("demo_encoder, tcfm", ABLATIONS)
+def test_every_parameter_has_one_adaptation_learning_rate_and_a_gradient(demo_encoder, tcfm):
+    policy = new_policy(demo_encoder=demo_encoder, tcfm=tcfm)
+    groups = policy.parameter_groups()
+    grouped = [id(p) for group in groups.values() for p in group]
+    assert sorted(grouped) == sorted(id(p) for p in policy.parameters())
+    assert set(map(id, policy.observation_encoder.parameters())) == set(map(id, groups["vision"]))
+    assert set(map(id, policy.unet.parameters())) == set(map(id, groups["diffusion"]))
+    policy.loss(**random_batch(policy.config)).backward()
+    without = [name for name, p in policy.named_parameters() if p.grad is None]
+    assert without == []
+
+
+@pytest.mark.parametrize("name", ["model", "maml", "data"])
+def test_a_module_made_to_be_copied_imports_nothing_from_the_project(name):
+    root = Path(model.__file__).parent
+    ours = {path.stem for path in root.glob("*.py")} | {"tests"}
+    imported = set()
+    for node in ast.walk(ast.parse((root / f"{name}.py").read_text())):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            imported.add(node.module.split(".")[0] if node.level == 0 else "tests")
+    assert "torch" in imported and not imported & ours
+
+
+# --- Diffusion -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def peer():
+    """diffusers' DDIM with the settings of the paper."""
+    scheduler = DDIMScheduler(
+        num_train_timesteps=100,
+        beta_schedule="squaredcos_cap_v2",
+        prediction_type="sample",
+        clip_sample=True,
+        set_alpha_to_one=True,
+        steps_offset=0,
+        timestep_spacing="leading",
+    )
+    scheduler.set_timesteps(10)
+    return scheduler
+
+
+def test_noising_equals_that_of_diffusers_at_every_step(peer):
+    schedule, every = DiffusionSchedule(), torch.arange(100)
+    clean, noise = torch.randn(2, 100, 16, 4, generator=torch.Generator().manual_seed(0))
+    expected = peer.add_noise(clean, noise, every)
+    torch.testing.assert_close(schedule.add_noise(clean, noise, every), expected, atol=1e-6, rtol=1e-6)
+
+
+def test_sampling_equals_a_full_run_of_diffusers(peer):
+    schedule, g = DiffusionSchedule(), torch.Generator().manual_seed(0)
+    assert schedule.timesteps() == peer.timesteps.tolist()
+    ours = theirs = torch.randn(3, 16, 4, generator=g)
+    clean = 3 * torch.rand(3, 16, 4, generator=g) - 1.5  # a third of it is to be clipped
+    for k in schedule.timesteps():
+        prediction = clean + 0.1 * torch.randn(3, 16, 4, generator=g)
+        ours = schedule.step(prediction, k, ours)
+        theirs = peer.step(prediction, k, theirs, eta=0.0).prev_sample
+        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-6)
+
+
+def test_sampled_actions_are_diffusers_run_of_the_denoiser_from_the_newest_observation_on(peer):
+    policy = new_policy()
+    batch = random_batch(policy.config)
+    policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
+    context = context_of(policy, batch)
+    observation = policy.encode_observations(batch["points"], batch["state"]).flatten(1)
+    actions = torch.randn(6, 16, 4, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        for k in peer.timesteps:
+            prediction = policy.denoise(actions, k.repeat(6), observation, context)
+            actions = peer.step(prediction, k, actions, eta=0.0).prev_sample
+    expected = policy.normalizer.unnormalize("action", actions)[:, 1:9]
+    torch.testing.assert_close(sample(policy, batch), expected, atol=1e-5, rtol=0)
+
+
+def test_the_timestep_embedding_equals_that_of_diffusers():
+    policy, seen = new_policy(), []
+    policy.unet.timestep_mlp.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    timesteps = torch.tensor([0, 1, 37, 99])
+    policy.unet.condition(timesteps, torch.zeros(4, 2 * policy.config.observation_feature_dim))
+    expected = get_timestep_embedding(timesteps, policy.config.timestep_dim, downscale_freq_shift=1)
+    torch.testing.assert_close(seen[0], expected, atol=1e-5, rtol=0)
+
+
+def test_sampling_is_repeatable_from_a_seed_and_shaped_as_an_action_chunk():
+    policy = new_policy()
+    batch = random_batch(policy.config, windows=5)
+    first, again, other = sample(policy, batch), sample(policy, batch), sample(policy, batch, seed=1)
+    assert first.shape == (5, 8, 4)
+    assert torch.equal(first, again) and not torch.allclose(first, other, atol=1e-2)
+
+
+def test_loss_is_a_pure_function_of_its_arguments_and_random_without_them():
+    policy = new_policy()
+    batch = random_batch(policy.config)
+    assert torch.equal(policy.loss(**batch), policy.loss(**batch))
+    for name in ("noise", "timesteps"):
+        without = {key: x for key, x in batch.items() if key != name}
+        assert not torch.equal(policy.loss(**without), policy.loss(**without))
+
+
+# --- The task: demonstration and instruction -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tasks, windows", [(1, 1), (1, 5), (3, 6)])
+def test_the_shared_key_path_of_u2t_equals_the_full_sequence_with_its_gradients(tasks, windows):
+    u2t, config = new_policy().double().u2t, TINY
+    draw = lambda *shape: torch.randn(shape, dtype=torch.float64, requires_grad=True)  # noqa: E731
+    inputs = h, demo, text = (
+        draw(windows, config.condition_dim),
+        draw(tasks, 7, config.demo_dim),
+        draw(tasks, config.text_dim),
+    )
+    weights = torch.randn(windows, config.condition_dim, dtype=torch.float64)
+    fused = u2t(h, u2t.encode_context(demo, text))
+    naive = u2t.full_sequence(h, u2t.embed(demo, text).repeat_interleave(windows // tasks, dim=0))
+    torch.testing.assert_close(fused, naive, atol=1e-6, rtol=0)
+    both = [torch.autograd.grad((x * weights).sum(), [*inputs, *u2t.parameters()]) for x in (fused, naive)]
+    for shared, full in zip(*both):
+        assert full.abs().max() > 0
+        torch.testing.assert_close(shared, full, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_the_loss_of_three_tasks_is_the_mean_of_their_losses(layers):
+    policy = new_policy(u2t_layers=layers)
+    batch = random_batch(policy.config, windows=6, tasks=3)
+    losses = [
+        policy.loss(
+            **{name: x[i : i + 1] if len(x) == 3 else x[2 * i : 2 * i + 2] for name, x in batch.items()},
+        )
+        for i in range(3)
+    ]
+    torch.testing.assert_close(policy.loss(**batch), torch.stack(losses).mean())
+    assert max(losses) - min(losses) > 1e-3
+
+
+def test_a_context_computed_once_serves_every_window_and_step():
+    policy = new_policy()
+    batch = random_batch(policy.config, windows=4)
+    context = context_of(policy, batch)
+    repeated = policy.encode_demo(*(batch[n].repeat_interleave(4, 0) for n in batch if n.startswith(("text", "demo"))))
+    for again in (context_of(policy, batch), repeated):
+        draws = [
+            policy.sample_actions(batch["points"], batch["state"], c, torch.Generator().manual_seed(0))
+            for c in (context, again)
+        ]
+        torch.testing.assert_close(*draws, atol=1e-5, rtol=0)
+
+
+def test_vmt_reads_the_order_of_frames_and_its_mlp_ablation_does_not():
+    features, actions = torch.randn(2, 10, TINY.observation_feature_dim), torch.randn(2, 10, TINY.action_dim)
+    vmt = new_policy().demo_encoder
+    reversed_tokens = vmt(features.flip(1), actions.flip(1)).flip(1)  # equal if only the frames, not their times, count
+    assert (vmt(features, actions) - reversed_tokens).abs().max() > 1e-2
+    mlp = new_policy(demo_encoder="mlp").demo_encoder
+    torch.testing.assert_close(mlp(features, actions), mlp(features.flip(1), actions.flip(1)), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["text", "demo_points", "demo_state", "demo_action"])
+def test_every_part_of_the_task_reaches_the_actions(name):
+    policy = new_policy()
+    batch = random_batch(policy.config)
+    other = batch | {name: random_batch(policy.config, seed=1)[name]}
+    assert (sample(policy, batch) - sample(policy, other)).abs().max() > 1e-4
+
+
+def test_the_order_of_a_clouds_points_changes_nothing():
+    policy = new_policy()
+    batch = random_batch(policy.config)
+    shuffled = dict(batch)
+    for name in ("points", "demo_points"):
+        order = torch.rand(batch[name].shape[:-1]).argsort(-1)[..., None].expand(batch[name].shape)  # one for each cloud
+        shuffled[name] = batch[name].gather(-2, order)
+        assert not torch.equal(shuffled[name], batch[name])
+    torch.testing.assert_close(sample(policy, shuffled), sample(policy, batch), atol=1e-6, rtol=0)
+
+
+def test_a_demonstration_longer_than_the_positions_is_refused_with_both_numbers():
+    policy = new_policy()
+    with pytest.raises(InputError, match=r"11 frames.* 10 positions"):
+        context_of(policy, random_batch(policy.config, frames=11))
+
+
+@pytest.mark.parametrize("tcfm", ["down", "mid", "up", "none"])
+def test_u2t_conditions_the_two_blocks_of_the_named_level_and_h_all_others(tcfm):
+    policy = new_policy(tcfm=tcfm, demo_encoder="none" if tcfm == "none" else "vmt", unet_widths=(16, 32, 64))
+    unet = policy.unet
+    levels = {"down": unet.down[0][:2], "mid": unet.mid, "up": unet.up[-1][:2], "none": []}
+    h, fused = torch.randn(2, 2, policy.config.condition_dim)
+    read = {}
+    for name, module in unet.named_modules():
+        if isinstance(module, model.ResidualBlock):
+            module.register_forward_pre_hook(lambda _, args, name=name: read.update({name: args[1]}))
+    unet(torch.randn(2, 16, 4), h, None if tcfm == "none" else fused)
+    named = {name for name, module in unet.named_modules() if any(module is block for block in levels[tcfm])}
+    assert len(read) == 12 and len(named) == (0 if tcfm == "none" else 2)
+    assert {name for name, condition in read.items() if condition is fused} == named
+    assert all(condition is h for name, condition in read.items() if name not in named)
+
+
+# --- Normalization and moving average --------------------------------------------------------------------------------
+
+
+def test_the_normalizer_maps_the_data_onto_minus_one_to_one_and_back():
+    normalizer = Normalizer(state_dim=3, action_dim=2)
+    points, state, action = 5 * torch.randn(7, 8, 3) + 2, torch.randn(7, 3), torch.randn(7, 2)
+    state[:, 1] = 0.7  # constant
+    state[:, 2] = 0.3 + 1e-6 * torch.rand(7)  # as good as constant
+    normalizer.fit(points, state, action)
+    for name, x in {"points": points, "state": state, "action": action}.items():
+        y = normalizer.normalize(name, x)
+        torch.testing.assert_close(normalizer.unnormalize(name, y), x, atol=1e-5, rtol=0)
+        low, high = y.flatten(0, -2).amin(0), y.flatten(0, -2).amax(0)
+        moving = slice(0, 1) if name == "state" else slice(None)
+        torch.testing.assert_close(low[moving], -torch.ones_like(low[moving]))
+        torch.testing.assert_close(high[moving], torch.ones_like(high[moving]))
+    assert normalizer.normalize("state", state)[:, 1:].abs().max() < 1e-5  # neither stretched nor divided by zero
+    torch.testing.assert_close(normalizer.normalize("state", torch.tensor([0.0, 0.9, 0.3]))[1], torch.tensor(0.2))
+
+
+def test_the_moving_average_follows_the_papers_decay():
+    policy = new_policy()
+    ema = model.ema_model(policy)
+    parameter, averaged = next(policy.parameters()), next(ema.module.parameters())
+    expected = averaged[0, 0].item()
+    for step in range(8):
+        with torch.no_grad():
+            parameter.fill_(step)
+        ema.update_parameters(policy)
+        decay = min(0.9999, 1 - (1 + step) ** -0.75)
+        expected = decay * expected + (1 - decay) * step
+        assert averaged[0, 0].item() == pytest.approx(expected, abs=1e-5)
+    ema.n_averaged.fill_(10**6)  # where the cap rules
+    ema.module.get_parameter("unet.head.1.bias").data.zero_()
+    policy.get_parameter("unet.head.1.bias").data.fill_(1.0)
+    ema.update_parameters(policy)
+    assert ema.module.get_parameter("unet.head.1.bias")[0].item() == pytest.approx(1e-4, rel=1e-3)
+
+
+# --- Learning from real Meta-World -----------------------------------------------------------------------------------
+
+
+def test_the_policy_overfits_one_real_window_batch_and_samples_its_actions(recorded):
+    policy = new_policy().train()
+    demonstrations = data.load_demonstrations(recorded / "reach.npz")
+    sampler = window_sampler(policy, demonstrations)
+    policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
+    generator = torch.Generator().manual_seed(0)
+    batch = sampler.batch(8, generator) | {"text": torch.randn(1, 512, generator=generator)}
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(150):
+        loss = policy.loss(**batch, **policy.draw_noise(8, generator))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert sum(losses[-20:]) / 20 < 0.05 * losses[0]
+    policy.eval()
+    context = context_of(policy, batch)
+    drawn = policy.sample_actions(batch["points"], batch["state"], context, generator)
+    wanted = batch["action"][:, 1:9]
+    spread = (wanted - wanted.mean((0, 1))).abs().mean()
+    assert (drawn - wanted).abs().mean() < 0.25 * spread
+
+
+# --- Checkpoints -----------------------------------------------------------------------------------------------------
+
+
+def test_a_checkpoint_gives_back_policy_normalizer_and_information(tmp_path):
+    policy = new_policy(demo_encoder="mlp", tcfm="up")
+    batch = random_batch(policy.config)
+    policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
+    model.save_checkpoint(tmp_path / "a.pt", policy, step=7, text_weights="random-seed-0", arguments={"lr": 1e-3})
+    again, info = model.load_checkpoint(tmp_path / "a.pt")
+    assert again.config == policy.config and not again.training
+    assert info["step"] == 7 and info["text_weights"] == "random-seed-0" and info["arguments"] == {"lr": 1e-3}
+    assert torch.equal(sample(again, batch), sample(policy, batch))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
+
+
+def bad_checkpoints(folder, good):
+    """Path -> what the message must say."""
+    raw = good.read_bytes()
+    files = {"missing": None, "truncated": raw[: len(raw) // 2], "empty": b"", "text": b"not a checkpoint"}
+    for name, content in files.items():
+        if content is not None:
+            (folder / name).write_bytes(content)
+    torch.save({"weights": torch.zeros(3)}, folder / "foreign")
+    torch.save([1, 2], folder / "list")
+    torch.save({"format": model.CHECKPOINT_FORMAT, "model": print}, folder / "pickled")
+    info = torch.load(good, weights_only=True)
+    torch.save(info | {"config": info["config"] | {"unet_widths": [32, 64]}}, folder / "shape")
+    torch.save(info | {"config": info["config"] | {"flavor": 1}}, folder / "newer")
+    torch.save({name: x for name, x in info.items() if name != "model"}, folder / "headless")
+    return {
+        "missing": "no checkpoint at",
+        "truncated": "damaged or not a PyTorch checkpoint",
+        "empty": "damaged or not a PyTorch checkpoint",
+        "text": "damaged or not a PyTorch checkpoint",
+        "pickled": "damaged or not a PyTorch checkpoint",
+        "foreign": "is not a 'DAMI checkpoint 1' file",
+        "list": "is not a 'DAMI checkpoint 1' file",
+        "shape": "do not fit",
+        "newer": "flavor",
+        "headless": "do not fit",
+    }
+
+
+def test_a_checkpoint_that_cannot_be_used_is_refused_in_one_line(tmp_path):
+    model.save_checkpoint(tmp_path / "good.pt", new_policy())
+    for name, message in bad_checkpoints(tmp_path, tmp_path / "good.pt").items():
+        with pytest.raises(InputError) as error:
+            model.load_checkpoint(tmp_path / name)
+        assert message in str(error.value) and name in str(error.value) and "\n" not in str(error.value), name
+
+
+def test_a_checkpoint_cannot_run_code(tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "ran"),)
+
+    torch.save({"format": model.CHECKPOINT_FORMAT, "config": Bomb()}, tmp_path / "bomb.pt")
+    with pytest.raises(InputError):
+        model.load_checkpoint(tmp_path / "bomb.pt")
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("failure", [OSError("disk full"), RuntimeError("disk full"), KeyboardInterrupt()])
+def test_a_failing_save_leaves_the_old_checkpoint_and_no_temporary_file(tmp_path, monkeypatch, failure):
+    model.save_checkpoint(tmp_path / "a.pt", new_policy(), step=1)
+
+    def half(_, path):
+        Path(path).write_bytes(b"half")
+        raise failure
+
+    monkeypatch.setattr(torch, "save", half)
+    with pytest.raises((OSError, KeyboardInterrupt)):
+        model.save_checkpoint(tmp_path / "a.pt", new_policy(seed=1), step=2)
+    assert model.load_checkpoint(tmp_path / "a.pt")[1]["step"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
+
+
+# --- python model.py -------------------------------------------------------------------------------------------------
+
+
+def test_the_printed_table_counts_every_preset(capsys):
+    model.main([])
+    printed = capsys.readouterr().out
+    for name, config in PRESETS.items():
+        with torch.device("meta"):
+            count = sum(p.numel() for p in DAMIPolicy(config).parameters())
+        assert f"{name}: {count:,} trainable parameters" in printed
+    assert "CLIP text tower" in printed

@@ -1,0 +1,412 @@
+"""Meta-training (Algorithm 1): second-order MAML over all tasks of a suite.
+
+    python train.py --suite ml10                                  # collects what is missing, trains, evaluates
+    python train.py --suite ml10 --preset tiny                    # the same in a few minutes, to see it work
+    python train.py --suite ml10 --resume                         # goes on where an interrupted run stopped
+    python train.py --suite ml10 --maml off --demo-encoder none --tcfm none      # multi-task DP3
+    torchrun --nproc-per-node 4 train.py --suite ml10             # tasks shared among 4 processes
+
+One batch, from disk to the loss: `task_batch` here draws windows and a reference demonstration from a
+`data.WindowSampler`, `maml.meta_gradient` takes the inner step and calls `model.DAMIPolicy.loss` twice.
+
+Whatever is random in outer step k follows from (seed, k, task) alone. A run that was killed and resumed therefore ends
+with the same bits as one that was not, and tasks may be shared among processes without changing what they draw.
+"""
+
+import argparse
+import json
+import math
+import os
+import signal
+import sys
+import time
+from dataclasses import asdict, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch import Tensor
+from torch.func import functional_call
+from tqdm import tqdm
+
+from data import InputError, WindowSampler, choose, collect, command_line, load_demonstrations, suite_tasks
+from evaluate import (
+    Successes,
+    evaluate,
+    hardware,
+    mean_success,
+    pick_device,
+    text_features,
+    window_sampler,
+    write_atomically,
+    write_report,
+)
+from maml import meta_gradient
+from model import PRESETS, DAMIPolicy, ema_model, load_checkpoint, save_checkpoint
+from model import InputError as ModelInputError
+
+# What a preset means for training; the architecture of the same name is in model.PRESETS.
+SETTINGS = {
+    "paper": {  # the hyperparameter table: 3000 epochs of 18 outer steps
+        "steps": 54_000,
+        "support": 20,  # windows a task for the inner step
+        "query": 88,  # windows a task for the outer loss
+        "inner_lr": 1e-4,
+        "first_order_share": 0.0,  # of the steps, the first ones; second order after them
+        "vectorize": False,  # all tasks at once; 258 M adapted parameters a task are too many
+        "lr": 1e-4,
+        "warmup": 500,
+        "checkpoint_every": 3_600,  # outer steps: the paper's 200 epochs
+        "evaluate_every": 3_600,
+        "episodes": 20,
+        "demonstrations": 10,
+    },
+    "small": {
+        "steps": 1_400,
+        "support": 8,
+        "query": 24,
+        "inner_lr": 1e-4,
+        "first_order_share": 0.6,  # half the time a step, nearly the same gradient while the policy is still rough
+        "vectorize": True,
+        "lr": 1e-3,
+        "warmup": 50,
+        "checkpoint_every": 140,
+        "evaluate_every": 1_400,
+        "episodes": 20,
+        "demonstrations": 10,
+    },
+    "tiny": {
+        "steps": 30,
+        "support": 4,
+        "query": 8,
+        "inner_lr": 1e-3,
+        "first_order_share": 0.0,
+        "vectorize": True,
+        "lr": 3e-3,
+        "warmup": 5,
+        "checkpoint_every": 15,
+        "evaluate_every": 30,
+        "episodes": 2,
+        "demonstrations": 2,
+    },
+}
+SAVE_SECONDS = 60  # between two savings of last.pt: what a killed run loses at most
+WINDOW = ("points", "state", "action", "noise", "timesteps")  # the parts of a batch that have an entry a window
+
+
+def learning_rate(step: int, steps: int, peak: float, warmup: int) -> float:
+    """Linear warm-up over `warmup` steps, then half a cosine down to zero at `steps`."""
+    if step < warmup:
+        return peak * (step + 1) / warmup
+    return peak * 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
+
+
+def task_batch(
+    policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, n: int, seed: tuple[int, ...]
+) -> dict[str, Tensor]:
+    """Draws n windows, a complete reference demonstration, noise and timesteps (Algorithm 1, lines 5, 6 and 9).
+
+    Returns the keyword arguments of `policy.loss`. They follow from `seed` alone.
+    """
+    generator = torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
+    return {"text": text[None], **sampler.batch(n, generator), **policy.draw_noise(n, generator)}
+
+
+def split(batch: dict[str, Tensor], n_support: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Splits the windows of a batch by index into support and query; both keep demonstration and instruction."""
+    support = {name: x[:n_support] if name in WINDOW else x for name, x in batch.items()}
+    query = {name: x[n_support:] if name in WINDOW else x for name, x in batch.items()}
+    return support, query
+
+
+def mean_loss_gradient(policy: DAMIPolicy, batches: list[dict[str, Tensor]]) -> tuple[dict[str, Tensor], Tensor]:
+    """The gradient of ordinary multi-task training: all windows of all tasks in one batch, no inner step."""
+    loss = policy.loss(**{name: torch.cat([batch[name] for batch in batches]) for name in batches[0]})
+    gradients = torch.autograd.grad(loss, list(policy.parameters()))
+    return dict(zip(dict(policy.named_parameters()), gradients)), loss.detach()[None]
+
+
+class StopRequest:
+    """Turns the first Ctrl-C into a request to stop after the step at hand; the second one interrupts at once."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self.previous = signal.signal(signal.SIGINT, self.handle)
+
+    def handle(self, *_: Any) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+    def restore(self) -> None:
+        signal.signal(signal.SIGINT, self.previous)
+
+
+def log(folder: Path, **values: Any) -> None:
+    """Appends a line to metrics.jsonl."""
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps(values) + "\n")
+
+
+def rewind_metrics(folder: Path, step: int) -> None:
+    """Drops the lines that a killed run wrote after its last save."""
+    path = folder / "metrics.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
+    write_atomically(path, lambda temporary: temporary.write_text("".join(f"{line}\n" for line in kept)))
+
+
+def draw_curves(folder: Path) -> None:
+    """Draws curves.png from metrics.jsonl: the query loss, its running mean, and success where it was measured."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    steps = np.array([line["step"] for line in lines if "loss" in line])
+    losses = np.array([line["loss"] for line in lines if "loss" in line])
+    evaluated = [(line["step"], line["success"]) for line in lines if "success" in line]
+    figure, axes = plt.subplots(figsize=(7, 3.6), layout="constrained")
+    axes.plot(steps, losses, color="C0", alpha=0.3, linewidth=0.8, label="query loss")
+    width = max(1, len(losses) // 50)
+    mean = np.convolve(losses, np.ones(width) / width, mode="valid")
+    axes.plot(steps[width - 1 :], mean, color="C0", label=f"mean of {width} steps")
+    axes.set(xlabel="outer step", ylabel="loss (actions in [-1, 1])", yscale="log")
+    axes.spines["top"].set_visible(False)
+    handles, labels = axes.get_legend_handles_labels()
+    if evaluated:
+        right = axes.twinx()
+        (line,) = right.plot(*zip(*evaluated), "o-", color="C1")
+        right.set(ylabel="mean success on base tasks, %", ylim=(0, 100))
+        right.spines["top"].set_visible(False)
+        handles, labels = [*handles, line], [*labels, "success (right)"]
+    axes.legend(handles, labels, frameon=False)
+    write_atomically(folder / "curves.png", lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
+    plt.close(figure)
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Meta-train a DAMI policy on a Meta-World suite (Algorithm 1).")
+    run = parser.add_argument_group("run")
+    run.add_argument("--suite", default="ml10", help="ml10 or ml45 (default: ml10)")
+    run.add_argument("--preset", help="paper, small or tiny (default: paper on CUDA, small on a CPU)")
+    run.add_argument("--data", default="data", help="folder of the demonstrations (default: data)")
+    run.add_argument("--out", help="folder of the run (default: runs/SUITE-PRESET-seedSEED)")
+    run.add_argument("--resume", action="store_true", help="go on from the run's last.pt")
+    run.add_argument("--seed", type=int, default=0, help="of weights, batches and noise (default: 0)")
+    run.add_argument("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
+    run.add_argument("--workers", type=int, help="processes for collecting and evaluating (default: one a core)")
+    run.add_argument("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: the cache, or a download)")
+    method = parser.add_argument_group("method (default: the preset's)")
+    method.add_argument("--maml", choices=("second", "first", "off"), default="second", help="order (default: second)")
+    method.add_argument("--demo-encoder", choices=("vmt", "mlp", "none"), help="encoder of the demonstration")
+    method.add_argument("--tcfm", choices=("down", "mid", "up", "none"), help="the U-Net level that reads it")
+    method.add_argument("--vectorize", action=argparse.BooleanOptionalAction, help="all tasks at once under vmap")
+    for name, kind, text in [
+        ("steps", int, "outer steps"),
+        ("support", int, "windows a task for the inner step"),
+        ("query", int, "windows a task for the outer loss"),
+        ("inner-lr", float, "learning rate of the inner step"),
+        ("first-order-share", float, "share of the steps that second-order MAML begins with in first order"),
+        ("lr", float, "peak learning rate of AdamW"),
+        ("warmup", int, "steps of linear warm-up"),
+        ("checkpoint-every", int, "steps between EMA checkpoints"),
+        ("evaluate-every", int, "steps between evaluations"),
+        ("episodes", int, "evaluation episodes a task; 0: never evaluate"),
+        ("demonstrations", int, "demonstrations a task"),
+    ]:
+        method.add_argument(f"--{name}", type=kind, help=text)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = parse(argv)
+    world, rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
+    device = pick_device(args.device)
+    if world > 1:
+        if device.type == "cuda" and device.index is None:
+            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        # The leader alone evaluates, and the others wait for it: hence the long time-out.
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=timedelta(hours=6))
+    leader = rank == 0
+    preset = choose(args.preset or ("paper" if device.type == "cuda" else "small"), SETTINGS, "preset")
+    settings = {
+        name: value if (given := getattr(args, name)) is None else given for name, value in SETTINGS[preset].items()
+    }
+    for name in ("steps", "support", "query", "checkpoint_every", "evaluate_every", "demonstrations"):
+        if settings[name] < 1:
+            raise InputError(f"--{name.replace('_', '-')} is {settings[name]}: use at least 1")
+    changes = {"demo_encoder": args.demo_encoder, "tcfm": args.tcfm}
+    config = replace(PRESETS[preset], **{name: value for name, value in changes.items() if value is not None})
+    tasks = suite_tasks(args.suite)[0]
+    folder = Path(args.out or f"runs/{args.suite}-{preset}-seed{args.seed}")
+    if leader:
+        print(f"preset {preset} on {device} ({hardware(device)}), {len(tasks)} tasks, run folder {folder}", flush=True)
+
+    # Demonstrations, collected by one process; the others wait for it
+    if leader:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / "last.pt").exists() and not args.resume:
+            raise InputError(f"{folder} already holds a run: add --resume to go on with it, or choose another --out")
+        collect(tasks, args.data, settings["demonstrations"], workers=args.workers)
+    if world > 1:
+        dist.barrier()
+    paths = {task: Path(args.data) / f"{task}.npz" for task in tasks}
+    demonstrations = [load_demonstrations(paths[task]).first(settings["demonstrations"]) for task in tasks]
+
+    # The policy, or the state in which it was left
+    arguments = {"suite": args.suite, "preset": preset, "seed": args.seed, "maml": args.maml, **settings}
+    torch.manual_seed(args.seed)
+    policy = DAMIPolicy(config).to(device)
+    ema = ema_model(policy)
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=settings["lr"], betas=(0.95, 0.999), weight_decay=1e-6)
+    start, seconds, identity = 0, 0.0, None
+    if args.resume and (folder / "last.pt").exists():
+        averaged, state = load_checkpoint(folder / "last.pt", device)
+        if averaged.config != config or state["arguments"] != arguments:
+            old = state["arguments"] | asdict(averaged.config)
+            new = arguments | asdict(config)
+            differing = ", ".join(
+                f"{name} {old.get(name)} -> {new[name]}" for name in new if old.get(name) != new[name]
+            )
+            raise InputError(f"{folder} was started with other settings ({differing}): give the old ones to resume it")
+        policy.load_state_dict(state["training"]["policy"])
+        ema.module.load_state_dict(averaged.state_dict())
+        ema.n_averaged.copy_(state["training"]["n_averaged"])
+        optimizer.load_state_dict(state["training"]["optimizer"])
+        start, seconds, identity = state["step"], state["seconds"], state["text_weights"]
+    else:
+        every = {
+            name: np.concatenate([getattr(d, name) for d in demonstrations]) for name in ("points", "state", "action")
+        }
+        every["points"] = every["points"][:, : config.num_points]
+        for module in (policy, ema.module):
+            module.normalizer.fit(**{name: torch.from_numpy(x) for name, x in every.items()})
+    features, identity = text_features([d.instruction for d in demonstrations], args.clip_weights, identity)
+    text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
+    samplers = {d.task: window_sampler(policy, d) for d in demonstrations}
+    info = {"suite": args.suite, "preset": preset, "text_weights": identity, "arguments": arguments}
+    if leader and start == 0:
+        (folder / "metrics.jsonl").unlink(missing_ok=True)
+        written = {
+            "arguments": arguments,
+            "config": asdict(config),
+            "text_weights": identity,
+            "hardware": hardware(device),
+        }
+        write_atomically(folder / "config.json", lambda temporary: temporary.write_text(json.dumps(written, indent=1)))
+    elif leader:
+        rewind_metrics(folder, start)
+
+    def save_last(step: int) -> None:
+        training = {"policy": policy.state_dict(), "n_averaged": ema.n_averaged, "optimizer": optimizer.state_dict()}
+        save_checkpoint(folder / "last.pt", ema.module, **info, step=step, seconds=seconds, training=training)
+
+    def measure(checkpoint: Path) -> Successes:
+        return evaluate(
+            checkpoint, paths, text, settings["episodes"], 0, args.workers, device, settings["demonstrations"]
+        )
+
+    def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
+        return functional_call(policy, params, (), batch)
+
+    stop = StopRequest()
+    first_order_steps = round(settings["first_order_share"] * settings["steps"])
+    params = dict(policy.named_parameters())
+    mine = list(enumerate(tasks))[rank::world]  # this process's share of the tasks
+    n = settings["support"] + settings["query"]
+    saved = time.monotonic()
+    progress = tqdm(
+        total=settings["steps"], initial=start, desc="training", unit="step", dynamic_ncols=True, disable=not leader
+    )
+    for step in range(start, settings["steps"]):
+        began = time.monotonic()
+
+        # One outer step (Algorithm 1, lines 3-21)
+        batches = (task_batch(policy, samplers[t], text[t], n, (args.seed, step, index)) for index, t in mine)
+        if args.maml == "off":
+            gradients, losses = mean_loss_gradient(policy, list(batches))
+        else:
+            pairs = (split(batch, settings["support"]) for batch in batches)
+            gradients, losses = meta_gradient(
+                loss_fn,
+                params,
+                pairs,
+                settings["inner_lr"],
+                first_order=args.maml == "first" or step < first_order_steps,
+                vectorize=settings["vectorize"],
+            )
+        loss = losses.mean()
+        if world > 1:  # the mean over all tasks is the mean of the processes' means, weighted by their shares
+            for x in (loss, *gradients.values()):
+                dist.all_reduce(x.mul_(len(mine) / len(tasks)))
+        norm = torch.nn.utils.get_total_norm(gradients.values())
+        if not torch.isfinite(loss + norm):
+            bad = [t for (_, t), value in zip(mine, losses) if not torch.isfinite(value)] if args.maml != "off" else []
+            raise InputError(
+                f"the loss or its gradient is not finite at step {step + 1} ({', '.join(bad) or 'all tasks'}); {folder}"
+                "/last.pt keeps the last good state: train again with a smaller --lr or --inner-lr"
+            )
+        for name, parameter in params.items():
+            parameter.grad = gradients[name]
+        lr = learning_rate(step, settings["steps"], settings["lr"], settings["warmup"])
+        optimizer.param_groups[0]["lr"] = lr
+        optimizer.step()
+        ema.update_parameters(policy)
+        seconds += time.monotonic() - began
+
+        # What it leaves behind
+        done = step + 1
+        if leader:
+            progress.update()
+            progress.set_postfix(loss=f"{loss:.4f}")
+            log(folder, step=done, loss=loss.item(), gradient_norm=norm.item(), lr=lr, seconds=round(seconds, 2))
+            milestone = done % settings["checkpoint_every"] == 0 or done == settings["steps"]
+            checkpoint = folder / f"ema-{done:05d}.pt"
+            if milestone:
+                save_checkpoint(checkpoint, ema.module, **info, step=done, seconds=seconds)
+                draw_curves(folder)
+            if milestone or stop.requested or time.monotonic() - saved > SAVE_SECONDS:
+                save_last(done)
+                saved = time.monotonic()
+            if (
+                milestone
+                and done % settings["evaluate_every"] == 0
+                and done < settings["steps"]
+                and settings["episodes"]
+            ):
+                successes = measure(checkpoint)
+                log(folder, step=done, success=mean_success(successes), successes=successes)
+        if stop.requested:
+            if leader:
+                print(f"\nsaved after step {done}; the same command with --resume goes on from there", file=sys.stderr)
+            raise KeyboardInterrupt
+    progress.close()
+    stop.restore()
+
+    # The success of the last checkpoint
+    if world > 1:
+        dist.destroy_process_group()
+    if leader and settings["episodes"]:
+        successes = measure(folder / f"ema-{settings['steps']:05d}.pt")
+        log(folder, step=settings["steps"], success=mean_success(successes), successes=successes)
+        draw_curves(folder)
+        facts = {
+            "title": f"{args.suite} base tasks, preset {preset}, step {settings['steps']}",
+            "episodes a task": settings["episodes"],
+            "training": f"{seconds / 60:.1f} min on {hardware(device)}",
+            "seed": args.seed,
+            "text weights": identity,
+            "date": time.strftime("%Y-%m-%d"),
+        }
+        print(f"\n{write_report(folder, {'last checkpoint': successes}, facts, args.suite)}")
+    if leader:
+        print(f"\n{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+
+
+if __name__ == "__main__":
+    command_line(main, ModelInputError)
