@@ -456,8 +456,10 @@ class Demonstrations:
         """Return the frames of one episode."""
         return slice(int(self.episode_ends[index - 1]) if index else 0, int(self.episode_ends[index]))
 
-    def first(self, n: int) -> Demonstrations:
-        """Return the first n episodes (views, no copies)."""
+    def first(self, n: int | None) -> Demonstrations:
+        """Return the first n episodes (views, no copies); None: all."""
+        if n is None:
+            return self
         if not 1 <= n <= len(self):
             raise InputError(f"{n} demonstrations of {self.task} were asked for, but there are {len(self)}")
         end = self.episode(n - 1).stop
@@ -782,6 +784,7 @@ def draw_demonstration(demonstrations: Demonstrations, out: str | Path, episode:
 
 def command_line(main: Callable[[], None], *errors: type[Exception]) -> None:
     """Run a script's `main`: what the user can cause ends in one line on stderr and exit code 2, Ctrl-C in 130."""
+    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     try:
         main()
     except KeyboardInterrupt:

@@ -18,9 +18,11 @@ import math
 import multiprocessing
 import os
 import platform
+import signal
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -230,6 +232,7 @@ worker: dict[str, Any] = {}  # what a worker process keeps between jobs: policy 
 
 
 def start_worker(checkpoint: str, device: str) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the starting process's business
     torch.set_num_threads(1)  # one process a core
     worker.update(policy=load_checkpoint(checkpoint, device)[0], task=None)
 
@@ -241,8 +244,9 @@ def run_job(
     policy = worker["policy"]
     if worker["task"] != task:
         demonstrations = load_demonstrations(data).first(n_demonstrations)
-        envs = [MetaWorldPointCloudEnv(task, policy.config.num_points) for _ in range(EPISODES_A_JOB)]
-        worker.update(task=task, sampler=window_sampler(policy, demonstrations), envs=envs)
+        worker.update(task=task, sampler=window_sampler(policy, demonstrations), envs=[])
+    while len(worker["envs"]) < episodes:
+        worker["envs"].append(MetaWorldPointCloudEnv(task, policy.config.num_points))
     seeds = [evaluation_seed(seed, first + i) for i in range(episodes)]
     generator = torch.Generator().manual_seed(seeds[0])
     text = torch.from_numpy(text).to(worker["sampler"].state.device)
@@ -269,7 +273,7 @@ def evaluate(
         seed: chooses goals, noise and reference demonstrations.
         workers: processes, by default one a core.
         device: where the policy runs.
-        n_demonstrations: use only the first so many of each file.
+        n_demonstrations: use only the first so many of each file; None: all.
 
     Returns:
         task -> E booleans, in the order of the episodes. They do not depend on the number of workers.
@@ -303,8 +307,10 @@ def evaluate(
                 task, first = pending[future][0], pending[future][5]
                 results[task][first] = future.result()
                 progress.update(len(results[task][first]))
+        except BrokenProcessPool:
+            raise InputError("an evaluating process was killed, perhaps for memory: try fewer --workers") from None
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)  # what is running ends first: at most a few seconds
             raise
     return {task: [s for first in sorted(parts) for s in parts[first]] for task, parts in results.items()}
 
@@ -349,7 +355,7 @@ def draw_success(columns: dict[str, Successes], path: Path, title: str, suite: s
 
     tasks = list(next(iter(columns.values())))
     groups = len(columns) + 1
-    figure, axes = plt.subplots(figsize=(2 + 0.9 * len(tasks), 3.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(max(4.5, 2 + 0.9 * len(tasks)), 3.6), layout="constrained")
     x, width = np.arange(len(tasks)), 0.8 / groups
     for i, (label, results) in enumerate(columns.items()):
         rates = np.array([np.mean(results[task]) for task in tasks])
@@ -364,7 +370,7 @@ def draw_success(columns: dict[str, Successes], path: Path, title: str, suite: s
     axes.set_xticks(x + width * (groups - 1) / 2, tasks, rotation=30, ha="right")
     axes.set(ylabel="success, %", ylim=(0, 105), title=title)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, ncols=groups, loc="upper left", bbox_to_anchor=(0, 1.0), fontsize=8)
+    figure.legend(frameon=False, ncols=groups, loc="outside upper center", fontsize=8)
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
     plt.close(figure)
 
@@ -372,7 +378,7 @@ def draw_success(columns: dict[str, Successes], path: Path, title: str, suite: s
 def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
     """Calls `write` with a temporary name beside `path`, then renames: the file is complete or the old one."""
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # with its suffix: some writers go by it
     try:
         write(temporary)
         os.replace(temporary, path)
@@ -509,6 +515,11 @@ def main(argv: list[str] | None = None) -> None:
     from finetune import adapt_checkpoint  # finetune.py imports this module; only the novel tasks need it
 
     args = parse(argv)
+    for name in ("demonstrations", "episodes", "steps"):
+        if getattr(args, name) < 1:
+            raise InputError(f"--{name} is {getattr(args, name)}: use at least 1")
+    if args.gif and not (args.task and args.gif.endswith(".gif")):
+        raise InputError("--gif draws one rollout to a .gif file: name its --task, as in --task reach --gif reach.gif")
     device = pick_device(args.device)
     groups = [checkpoints_of(path, args.top) for path in args.checkpoint or [newest_checkpoint()]]
     policy, info = load_checkpoint(groups[0][-1], device)
@@ -526,8 +537,6 @@ def main(argv: list[str] | None = None) -> None:
     text = dict(zip(chosen, features.to(device)))
 
     if args.gif:
-        if not args.task:
-            raise InputError("--gif draws one rollout: name its --task")
         sampler = window_sampler(policy, demonstrations[args.task])
         success = write_gif(policy, sampler, text[args.task], args.seed, args.gif)
         print(f"{args.task}: {'success' if success else 'failure'}; wrote {args.gif}")

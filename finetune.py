@@ -178,7 +178,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--workers", type=int, help="processes for collecting and evaluating (default: one a core)")
     parser.add_argument("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as in the checkpoint)")
-    parser.add_argument("--demonstrations", type=int, default=10, help="demonstrations to adapt to (default: 10)")
+    parser.add_argument("--demonstrations", type=int, help="the first so many (default: 10, or all of a file's)")
     parser.add_argument("--steps", type=int, default=200, help="gradient steps (default: 200)")
     parser.add_argument("--batch", type=int, help="windows a step (default: paper 108, small 64, tiny 16)")
     parser.add_argument(
@@ -191,9 +191,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    for name in ("steps", "demonstrations"):
-        if getattr(args, name) < 1:
-            raise InputError(f"--{name} is {getattr(args, name)}: use at least 1")
+    for name in ("steps", "batch", "demonstrations"):
+        if (value := getattr(args, name)) is not None and value < 1:
+            raise InputError(f"--{name} is {value}: use at least 1")
     device = pick_device(args.device)
     data = Path(args.data)
     if args.task is None and data.suffix != ".npz":
@@ -204,9 +204,11 @@ def main(argv: list[str] | None = None) -> None:
     _, info = load_checkpoint(checkpoint)
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {device} ({hardware(device)})", flush=True)
 
+    n_demonstrations = args.demonstrations
     if data.suffix != ".npz":
-        data = collect([args.task], data, args.demonstrations, workers=args.workers)[args.task]
-    demonstrations = load_demonstrations(data).first(args.demonstrations)
+        n_demonstrations = n_demonstrations or 10
+        data = collect([args.task], data, n_demonstrations, workers=args.workers)[args.task]
+    demonstrations = load_demonstrations(data).first(n_demonstrations)
     task = args.task or demonstrations.task
     features, identity = text_features([demonstrations.instruction], args.clip_weights, info["text_weights"])
     text = features[0].to(device)

@@ -240,6 +240,8 @@ def main(argv: list[str] | None = None) -> None:
     for name in ("steps", "support", "query", "checkpoint_every", "evaluate_every", "demonstrations"):
         if settings[name] < 1:
             raise InputError(f"--{name.replace('_', '-')} is {settings[name]}: use at least 1")
+    if args.seed < 0:
+        raise InputError(f"--seed is {args.seed}: use 0 or more")
     changes = {"demo_encoder": args.demo_encoder, "tcfm": args.tcfm}
     config = replace(PRESETS[preset], **{name: value for name, value in changes.items() if value is not None})
     tasks = suite_tasks(args.suite)[0]
@@ -347,9 +349,11 @@ def main(argv: list[str] | None = None) -> None:
         norm = torch.nn.utils.get_total_norm(gradients.values())
         if not torch.isfinite(loss + norm):
             bad = [t for (_, t), value in zip(mine, losses) if not torch.isfinite(value)] if args.maml != "off" else []
+            progress.close()
+            kept = f"; {folder}/last.pt keeps the last good state" if (folder / "last.pt").exists() else ""
             raise InputError(
-                f"the loss or its gradient is not finite at step {step + 1} ({', '.join(bad) or 'all tasks'}); {folder}"
-                "/last.pt keeps the last good state: train again with a smaller --lr or --inner-lr"
+                f"the loss or its gradient is not finite at step {step + 1} (tasks: {', '.join(bad) or 'all'}){kept}: "
+                "train again with a smaller --lr or --inner-lr, in another --out"
             )
         for name, parameter in params.items():
             parameter.grad = gradients[name]
@@ -383,7 +387,9 @@ def main(argv: list[str] | None = None) -> None:
                 log(folder, step=done, success=mean_success(successes), successes=successes)
         if stop.requested:
             if leader:
-                print(f"\nsaved after step {done}; the same command with --resume goes on from there", file=sys.stderr)
+                progress.close()
+                print(f"saved after step {done}: the same command with --resume goes on from there", file=sys.stderr)
+            stop.restore()
             raise KeyboardInterrupt
     progress.close()
     stop.restore()

@@ -60,9 +60,46 @@ def demonstration(task: str) -> Demonstrations:
     return Demonstrations(task, "bench", **arrays, episode_ends=np.array([len(arrays["action"])]), meta={})
 
 
+def preset_times(preset: str, recorded: Demonstrations, tasks: int, device: torch.device, repeat: int) -> list[float]:
+    """Milliseconds: outer step in second order, in first order, without MAML; adaptation step; control step; encoding."""
+    settings, config = SETTINGS[preset], PRESETS[preset]
+    torch.manual_seed(0)
+    policy = DAMIPolicy(config).to(device)
+    sampler = window_sampler(policy, recorded)
+    policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
+    text = torch.randn(config.text_dim, generator=torch.Generator().manual_seed(0)).to(device)
+    params = dict(policy.named_parameters())
+    n = settings["support"] + settings["query"]
+    batches = [task_batch(policy, sampler, text, n, (0, 0, task)) for task in range(tasks)]
+    pairs = [split(batch, settings["support"]) for batch in batches]
+    one = task_batch(policy, sampler, text, 1, (0, 0, 0))
+    adaptation_steps = 5
+
+    def loss_fn(params, batch):
+        return functional_call(policy, params, (), batch)
+
+    def outer_step(first_order: bool):
+        return meta_gradient(loss_fn, params, pairs, settings["inner_lr"], 1, first_order, settings["vectorize"])
+
+    @torch.no_grad()
+    def encode():
+        return policy.encode_demo(*(one[name] for name in ("text", "demo_points", "demo_state", "demo_action")))
+
+    context = encode()
+    return [
+        median_ms(lambda: outer_step(first_order=False), repeat),
+        median_ms(lambda: outer_step(first_order=True), repeat),
+        median_ms(lambda: mean_loss_gradient(policy, batches), repeat),
+        median_ms(lambda: adapt_policy(policy, sampler, text, adaptation_steps, BATCH[preset]), repeat)
+        / adaptation_steps,
+        median_ms(lambda: policy.sample_actions(one["points"], one["state"], context), repeat),
+        median_ms(encode, repeat),
+    ]
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--presets", nargs="+", default=["small", "tiny"], choices=PRESETS)
+    parser.add_argument("--presets", nargs="+", default=["small", "tiny"], choices=PRESETS, help="paper takes minutes")
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--tasks", type=int, default=10, help="tasks an outer step (default: 10, as ML10)")
     parser.add_argument("--device")
@@ -76,41 +113,11 @@ def main(argv: list[str] | None = None) -> None:
         cells = [f"{ms:.1f}" for ms in (*times.values(), sum(times.values()))]
         print(f"| {task} | {' | '.join(cells)} |", flush=True)
 
-    recorded = demonstration("drawer-close")
-    text = torch.randn(512, generator=torch.Generator().manual_seed(0)).to(device)
     names = ["outer step, second order", "first order", "no MAML", "adaptation step", "control step", "demonstration"]
     print(f"\n| {args.tasks} tasks | {' | '.join(names)} |\n|{'---|' * (len(names) + 1)}")
+    recorded = demonstration("drawer-close")
     for preset in args.presets:
-        settings, config = SETTINGS[preset], PRESETS[preset]
-        torch.manual_seed(0)
-        policy = DAMIPolicy(config).to(device)
-        sampler = window_sampler(policy, recorded)
-        policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
-        params = dict(policy.named_parameters())
-        n = settings["support"] + settings["query"]
-        batches = [task_batch(policy, sampler, text, n, (0, 0, task)) for task in range(args.tasks)]
-        pairs = [split(batch, settings["support"]) for batch in batches]
-
-        def loss_fn(params, batch, policy=policy):
-            return functional_call(policy, params, (), batch)
-
-        def outer_step(first_order, params=params, pairs=pairs, settings=settings, loss_fn=loss_fn):
-            return meta_gradient(loss_fn, params, pairs, settings["inner_lr"], 1, first_order, settings["vectorize"])
-
-        demo = sampler.batch(1, torch.Generator().manual_seed(0))
-        with torch.no_grad():
-            encode = lambda: policy.encode_demo(text[None], demo["demo_points"], demo["demo_state"], demo["demo_action"])  # noqa: E731, B023
-            context = encode()
-            demo_ms = median_ms(encode, args.repeat)
-        steps = 5
-        times = [
-            median_ms(lambda: outer_step(False), args.repeat),  # noqa: B023
-            median_ms(lambda: outer_step(True), args.repeat),  # noqa: B023
-            median_ms(lambda: mean_loss_gradient(policy, batches), args.repeat),  # noqa: B023
-            median_ms(lambda: adapt_policy(policy, sampler, text, steps, BATCH[preset]), args.repeat) / steps,  # noqa: B023
-            median_ms(lambda: policy.sample_actions(demo["points"], demo["state"], context), args.repeat),  # noqa: B023
-            demo_ms,
-        ]
+        times = preset_times(preset, recorded, args.tasks, device, args.repeat)
         print(f"| {preset} | {' | '.join(f'{ms:.1f}' for ms in times)} |", flush=True)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before torch; on matrices this small, threads only wait for each other
 
-import data  # noqa: E402
+import data
 
 BASE, NOVEL = ["reach", "drawer-close", "window-open"], ["door-close"]
 

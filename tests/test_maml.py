@@ -86,11 +86,12 @@ def test_the_meta_gradient_of_the_policy_equals_finite_differences_and_first_ord
     for direction in (second - first, torch.randn_like(start), torch.randn_like(start)):
         direction = direction / direction.norm()
         h = 1e-6  # short, so that hardly ever a ReLU or a maximum switches in between
-        slope = objective(setting, start + h * direction, lr, steps) - objective(setting, start - h * direction, lr, steps)
+        slope = objective(setting, start + h * direction, lr, steps) - objective(
+            setting, start - h * direction, lr, steps
+        )
         slope = slope / (2 * h)
         assert float(second @ direction) == pytest.approx(slope, rel=1e-5, abs=1e-8)
-    print((second - first).norm() / first.norm())
-    assert (second - first).norm() > 0.3 * first.norm()
+    assert (second - first).norm() > first.norm()
 
 
 @pytest.mark.parametrize("steps", [1, 4])
@@ -161,7 +162,9 @@ def test_adapting_takes_the_steps_of_torchs_sgd_and_leaves_its_input(setting, fi
 def test_without_tasks_there_is_no_meta_gradient():
     for vectorize in (False, True):
         with pytest.raises(ValueError, match="at least one task"):
-            meta_gradient(lambda params, batch: params["x"].sum(), {"x": torch.ones(1)}, iter([]), 0.1, vectorize=vectorize)
+            meta_gradient(
+                lambda params, batch: params["x"].sum(), {"x": torch.ones(1)}, iter([]), 0.1, vectorize=vectorize
+            )
 
 
 # --- Memory ----------------------------------------------------------------------------------------------------------
@@ -194,7 +197,7 @@ def test_memory_does_not_grow_with_the_number_of_tasks(setting):
                 alive.append(storages.alive())  # what is left of the tasks so far
                 yield setting.batch(2 * i, 4), setting.batch(2 * i + 1, 6)
 
-        gradients, losses = meta_gradient(setting.loss, setting.params, tasks(), 0.1)
+        _, losses = meta_gradient(setting.loss, setting.params, tasks(), 0.1)
     assert len(losses) == 5 and max(size for _, size in storages.made) > 1000
     parameters = sum(p.numel() for p in setting.params.values()) * 8
     assert max(alive) < 3.5 * parameters  # the sum, one task's gradients, one task's batch; no graph

@@ -256,7 +256,9 @@ def test_the_order_of_a_clouds_points_changes_nothing():
     batch = random_batch(policy.config)
     shuffled = dict(batch)
     for name in ("points", "demo_points"):
-        order = torch.rand(batch[name].shape[:-1]).argsort(-1)[..., None].expand(batch[name].shape)  # one for each cloud
+        order = (
+            torch.rand(batch[name].shape[:-1]).argsort(-1)[..., None].expand(batch[name].shape)
+        )  # one for each cloud
         shuffled[name] = batch[name].gather(-2, order)
         assert not torch.equal(shuffled[name], batch[name])
     torch.testing.assert_close(sample(policy, shuffled), sample(policy, batch), atol=1e-6, rtol=0)
