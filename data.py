@@ -623,6 +623,8 @@ def collect(
     """
     if episodes < 1:
         raise InputError(f"--episodes is {episodes}: use at least 1")
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers is {workers}: use at least 1")
     demonstration_seed(seed, 0)
     paths = {check_task(task): Path(folder) / f"{task}.npz" for task in tasks}
     missing = []
@@ -795,7 +797,7 @@ def command_line(main: Callable[[], None], *errors: type[Exception]) -> None:
         sys.exit(2)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Collect expert demonstrations of Meta-World tasks, or draw one.")
     parser.add_argument("--suite", default="ml10", help="ml10 or ml45: collect all its tasks (default: ml10)")
     parser.add_argument("--task", help="collect only this task")
@@ -805,8 +807,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     parser.add_argument("--show", metavar="FILE", help="draw a file's first demonstration instead of collecting")
     parser.add_argument("--out", help="the picture of --show (default: FILE with .png)")
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
 
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(argv)
     if args.show:
         out = args.out or Path(args.show).with_suffix(".png")
         draw_demonstration(load_demonstrations(args.show), out)

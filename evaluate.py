@@ -100,6 +100,15 @@ def newest_checkpoint(runs: str | Path = "runs") -> Path:
     return checkpoints[-1]
 
 
+def load_trained(path: str | Path, device: str | torch.device = "cpu") -> tuple[DAMIPolicy, dict[str, Any]]:
+    """`model.load_checkpoint`, for a file that says how it was trained. Raises InputError for one that does not."""
+    policy, info = load_checkpoint(path, device)
+    needed = ("suite", "preset", "arguments", "text_weights", "step")
+    if missing := [name for name in needed if name not in info]:
+        raise InputError(f"{path} does not say its {', '.join(missing)}: use a checkpoint of train.py or finetune.py")
+    return policy, info
+
+
 def text_features(instructions: Sequence[str], weights: str | None, identity: str | None = None) -> tuple[Tensor, str]:
     """Encodes instructions with CLIP's frozen text tower, once.
 
@@ -293,6 +302,8 @@ def evaluate(
         for task, path in demonstrations.items()
         for first in range(0, episodes, EPISODES_A_JOB)
     ]
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers is {workers}: use at least 1")
     workers = min(workers or os.cpu_count() or 1, len(jobs))
     results: dict[str, dict[int, list[bool]]] = {task: {} for task in demonstrations}
     with (
@@ -518,11 +529,12 @@ def main(argv: list[str] | None = None) -> None:
     for name in ("demonstrations", "episodes", "steps"):
         if getattr(args, name) < 1:
             raise InputError(f"--{name} is {getattr(args, name)}: use at least 1")
+    evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after the adaptation
     if args.gif and not (args.task and args.gif.endswith(".gif")):
         raise InputError("--gif draws one rollout to a .gif file: name its --task, as in --task reach --gif reach.gif")
     device = pick_device(args.device)
     groups = [checkpoints_of(path, args.top) for path in args.checkpoint or [newest_checkpoint()]]
-    policy, info = load_checkpoint(groups[0][-1], device)
+    policy, info = load_trained(groups[0][-1], device)
     suite = args.suite or info["suite"]
     base, novel = suite_tasks(suite)
     chosen = {"base": base, "novel": novel, "all": base + novel}[args.split]
@@ -543,7 +555,7 @@ def main(argv: list[str] | None = None) -> None:
         return
 
     def measure(checkpoint: Path) -> Successes:
-        _, info = load_checkpoint(checkpoint)
+        _, info = load_trained(checkpoint)
         if info["text_weights"] != identity:
             raise InputError(f"{checkpoint} was made with the text weights {info['text_weights']!r}, not {identity!r}")
         settings = (args.episodes, args.seed, args.workers, device, args.demonstrations)
@@ -551,13 +563,14 @@ def main(argv: list[str] | None = None) -> None:
         successes = evaluate(checkpoint, {task: paths[task] for task in direct}, text, *settings) if direct else {}
         for task in chosen:
             if task not in direct:  # a novel task: adapt first
-                adapted = out / f"{checkpoint.parent.name}-{checkpoint.stem}-{task}.pt"
+                label = str(checkpoint.with_suffix("")).replace("/", "-").lstrip("-.")
+                adapted = out / f"{label}-{task}.pt"
                 adapt_checkpoint(checkpoint, demonstrations[task], text[task], adapted, args.steps, seed=args.seed)
                 successes |= evaluate(adapted, {task: paths[task]}, text, *settings)
         return successes
 
     results = {checkpoint: measure(checkpoint) for checkpoints in groups for checkpoint in checkpoints}
-    columns = {f"{path.parent.name}/{path.stem}": results[path] for path in (group[-1] for group in groups)}
+    columns = {str(group[-1].with_suffix("")): results[group[-1]] for group in groups}
     facts = {
         "title": f"{suite}, {args.split} tasks" if not args.task else args.task,
         "episodes a task": args.episodes,

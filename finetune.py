@@ -29,11 +29,13 @@ from data import (
     check_task,
     collect,
     command_line,
+    evaluation_seed,
     load_demonstrations,
 )
 from evaluate import (
     evaluate,
     hardware,
+    load_trained,
     newest_checkpoint,
     pick_device,
     text_features,
@@ -41,7 +43,7 @@ from evaluate import (
     write_atomically,
     write_report,
 )
-from model import DAMIPolicy, ema_model, load_checkpoint, save_checkpoint
+from model import DAMIPolicy, ema_model, save_checkpoint
 from model import InputError as ModelInputError
 
 # AdamW's learning rates for the parts of the policy. The paper's belong to a meta-training at 1e-4; those of the other
@@ -134,7 +136,7 @@ def adapt_checkpoint(
     Raises:
         InputError: checkpoint and demonstrations do not fit each other, or the loss is not finite.
     """
-    policy, info = load_checkpoint(checkpoint, text.device)
+    policy, info = load_trained(checkpoint, text.device)
     sampler = window_sampler(policy, demonstrations)
     if normalizer == "fit":
         policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
@@ -194,6 +196,7 @@ def main(argv: list[str] | None = None) -> None:
     for name in ("steps", "batch", "demonstrations"):
         if (value := getattr(args, name)) is not None and value < 1:
             raise InputError(f"--{name} is {value}: use at least 1")
+    evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after the adaptation
     device = pick_device(args.device)
     data = Path(args.data)
     if args.task is None and data.suffix != ".npz":
@@ -201,7 +204,7 @@ def main(argv: list[str] | None = None) -> None:
     if args.task is not None:
         check_task(args.task)
     checkpoint = Path(args.checkpoint) if args.checkpoint else newest_checkpoint()
-    _, info = load_checkpoint(checkpoint)
+    _, info = load_trained(checkpoint)
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {device} ({hardware(device)})", flush=True)
 
     n_demonstrations = args.demonstrations

@@ -34,7 +34,6 @@ from tqdm import tqdm
 
 from data import InputError, WindowSampler, choose, collect, command_line, load_demonstrations, suite_tasks
 from evaluate import (
-    Successes,
     evaluate,
     hardware,
     mean_success,
@@ -308,11 +307,6 @@ def main(argv: list[str] | None = None) -> None:
         training = {"policy": policy.state_dict(), "n_averaged": ema.n_averaged, "optimizer": optimizer.state_dict()}
         save_checkpoint(folder / "last.pt", ema.module, **info, step=step, seconds=seconds, training=training)
 
-    def measure(checkpoint: Path) -> Successes:
-        return evaluate(
-            checkpoint, paths, text, settings["episodes"], 0, args.workers, device, settings["demonstrations"]
-        )
-
     def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         return functional_call(policy, params, (), batch)
 
@@ -350,7 +344,7 @@ def main(argv: list[str] | None = None) -> None:
         if not torch.isfinite(loss + norm):
             bad = [t for (_, t), value in zip(mine, losses) if not torch.isfinite(value)] if args.maml != "off" else []
             progress.close()
-            kept = f"; {folder}/last.pt keeps the last good state" if (folder / "last.pt").exists() else ""
+            kept = f"; {folder}/last.pt keeps an earlier state" if (folder / "last.pt").exists() else ""
             raise InputError(
                 f"the loss or its gradient is not finite at step {step + 1} (tasks: {', '.join(bad) or 'all'}){kept}: "
                 "train again with a smaller --lr or --inner-lr, in another --out"
@@ -369,48 +363,51 @@ def main(argv: list[str] | None = None) -> None:
             progress.update()
             progress.set_postfix(loss=f"{loss:.4f}")
             log(folder, step=done, loss=loss.item(), gradient_norm=norm.item(), lr=lr, seconds=round(seconds, 2))
-            milestone = done % settings["checkpoint_every"] == 0 or done == settings["steps"]
-            checkpoint = folder / f"ema-{done:05d}.pt"
+            final = done == settings["steps"]
+            milestone = final or done % settings["checkpoint_every"] == 0
             if milestone:
+                checkpoint = folder / f"ema-{done:05d}.pt"
                 save_checkpoint(checkpoint, ema.module, **info, step=done, seconds=seconds)
+                if settings["episodes"] and (final or done % settings["evaluate_every"] == 0):
+                    successes = evaluate(
+                        checkpoint,
+                        paths,
+                        text,
+                        settings["episodes"],
+                        0,
+                        args.workers,
+                        device,
+                        settings["demonstrations"],
+                    )
+                    log(folder, step=done, success=mean_success(successes), successes=successes)
                 draw_curves(folder)
             if milestone or stop.requested or time.monotonic() - saved > SAVE_SECONDS:
-                save_last(done)
+                save_last(done)  # after the evaluation: a run killed in it comes back to it
                 saved = time.monotonic()
-            if (
-                milestone
-                and done % settings["evaluate_every"] == 0
-                and done < settings["steps"]
-                and settings["episodes"]
-            ):
-                successes = measure(checkpoint)
-                log(folder, step=done, success=mean_success(successes), successes=successes)
-        if stop.requested:
+        if stop.requested and done < settings["steps"]:
+            progress.close()
             if leader:
-                progress.close()
                 print(f"saved after step {done}: the same command with --resume goes on from there", file=sys.stderr)
             stop.restore()
             raise KeyboardInterrupt
     progress.close()
     stop.restore()
-
-    # The success of the last checkpoint
     if world > 1:
         dist.destroy_process_group()
-    if leader and settings["episodes"]:
-        successes = measure(folder / f"ema-{settings['steps']:05d}.pt")
-        log(folder, step=settings["steps"], success=mean_success(successes), successes=successes)
-        draw_curves(folder)
-        facts = {
-            "title": f"{args.suite} base tasks, preset {preset}, step {settings['steps']}",
-            "episodes a task": settings["episodes"],
-            "training": f"{seconds / 60:.1f} min on {hardware(device)}",
-            "seed": args.seed,
-            "text weights": identity,
-            "date": time.strftime("%Y-%m-%d"),
-        }
-        print(f"\n{write_report(folder, {'last checkpoint': successes}, facts, args.suite)}")
-    if leader:
+
+    if leader and start == settings["steps"]:
+        print(f"{folder} was finished before: nothing left to do")
+    elif leader:
+        if settings["episodes"]:
+            facts = {
+                "title": f"{args.suite} base tasks, preset {preset}, step {settings['steps']}",
+                "episodes a task": settings["episodes"],
+                "training": f"{seconds / 60:.1f} min on {hardware(device)}",
+                "seed": args.seed,
+                "text weights": identity,
+                "date": time.strftime("%Y-%m-%d"),
+            }
+            print(f"\n{write_report(folder, {'last checkpoint': successes}, facts, args.suite)}")
         print(f"\n{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
 
 

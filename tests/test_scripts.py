@@ -518,23 +518,25 @@ def test_an_adaptation_that_diverges_stops_and_writes_nothing(run, recorded, cap
 
 def readme_commands():
     """The command lines of README.md's bash blocks that call one of the scripts: (script, arguments)."""
-    readme = ROOT / "README.md"
-    text = readme.read_text() if readme.exists() else ""
+    text = (ROOT / "README.md").read_text()
     blocks = re.findall(r"```(?:bash|sh)\n(.*?)```", text, flags=re.DOTALL)
     lines = [line.strip() for block in blocks for line in block.replace("\\\n", " ").splitlines()]
     commands = []
     for line in lines:
         for part in line.split("&&"):
             words = shlex.split(part, comments=True)
-            names = [i for i, word in enumerate(words) if Path(word).name in ("train.py", "finetune.py", "evaluate.py")]
+            names = [
+                i
+                for i, word in enumerate(words)
+                if Path(word).name in ("train.py", "finetune.py", "evaluate.py", "data.py")
+            ]
             if names and words[0] in ("python", "torchrun"):
                 commands.append((Path(words[names[0]]).stem, words[names[0] + 1 :]))
     return commands
 
 
-@pytest.mark.skipif(not (ROOT / "README.md").exists(), reason="there is no README.md yet")
 def test_the_readmes_commands_are_understood():
     commands = readme_commands()
-    assert {name for name, _ in commands} == {"train", "finetune", "evaluate"}
+    assert {name for name, _ in commands} == {"train", "finetune", "evaluate", "data"}
     for name, arguments in commands:
-        {"train": train, "finetune": finetune, "evaluate": evaluate}[name].parse(arguments)
+        {"train": train, "finetune": finetune, "evaluate": evaluate, "data": data}[name].parse(arguments)
