@@ -331,14 +331,15 @@ class RayCastCamera:
 
 
 def farthest_point_sample(points: np.ndarray, n: int) -> np.ndarray:
-    """Sample n of the points (M, 3) float32, each the farthest from all before it, beginning with points[0].
+    """Sample n of the points (M, 3) float32, each the farthest from all before it.
 
     Returns (n, 3) float32 in the order of selection, so that the first k of the n are themselves such a sample of k.
-    With M < n the sample is repeated from its beginning. Raises ValueError for an empty cloud.
+    The same cloud always gives the same sample. With M < n the sample is repeated from its beginning.
+    Raises ValueError for an empty cloud.
     """
     if len(points) == 0:
         raise ValueError("the cloud is empty: no ray met anything inside the workspace")
-    order = fpsample.fps_sampling(points, min(n, len(points)), start_idx=0)  # the library's trees start elsewhere
+    order = fpsample.bucket_fps_kdline_sampling(points, min(n, len(points)), h=3, start_idx=0)  # 0: of the tree's order
     return points[np.resize(order.astype(np.int64), n)]  # (n, 3)
 
 
@@ -553,7 +554,7 @@ RECIPE = {
     "camera": [CAMERA, list(CAMERA_POSITION), CAMERA_PIXELS],
     "workspace": [list(corner) for corner in WORKSPACE],
     "num_points": NUM_POINTS,
-    "sampling": "farthest points, the first ray's first",
+    "sampling": "farthest points",
 }
 
 
