@@ -339,7 +339,10 @@ def farthest_point_sample(points: np.ndarray, n: int) -> np.ndarray:
     """
     if len(points) == 0:
         raise ValueError("the cloud is empty: no ray met anything inside the workspace")
-    order = fpsample.bucket_fps_kdline_sampling(points, min(n, len(points)), h=3, start_idx=0)  # 0: of the tree's order
+    if len(points) < 8:  # too few for a tree of 2**3 buckets
+        order = fpsample.fps_sampling(points, min(n, len(points)), start_idx=0)
+    else:
+        order = fpsample.bucket_fps_kdline_sampling(points, min(n, len(points)), h=3, start_idx=0)
     return points[np.resize(order.astype(np.int64), n)]  # (n, 3)
 
 
