@@ -534,6 +534,9 @@ def main(argv: list[str] | None = None) -> None:
         raise InputError("--gif draws one rollout to a .gif file: name its --task, as in --task reach --gif reach.gif")
     device = pick_device(args.device)
     groups = [checkpoints_of(path, args.top) for path in args.checkpoint or [newest_checkpoint()]]
+    labels = {path: f"{path.resolve().parent.name}/{path.stem}" for group in groups for path in group}
+    if len(set(labels.values())) < sum(map(len, groups)):
+        raise InputError("two of the checkpoints have the same folder and file name: rename the folder of one run")
     policy, info = load_trained(groups[0][-1], device)
     suite = args.suite or info["suite"]
     base, novel = suite_tasks(suite)
@@ -563,14 +566,13 @@ def main(argv: list[str] | None = None) -> None:
         successes = evaluate(checkpoint, {task: paths[task] for task in direct}, text, *settings) if direct else {}
         for task in chosen:
             if task not in direct:  # a novel task: adapt first
-                label = str(checkpoint.with_suffix("")).replace("/", "-").lstrip("-.")
-                adapted = out / f"{label}-{task}.pt"
+                adapted = out / f"{labels[checkpoint].replace('/', '-')}-{task}.pt"
                 adapt_checkpoint(checkpoint, demonstrations[task], text[task], adapted, args.steps, seed=args.seed)
                 successes |= evaluate(adapted, {task: paths[task]}, text, *settings)
         return successes
 
     results = {checkpoint: measure(checkpoint) for checkpoints in groups for checkpoint in checkpoints}
-    columns = {str(group[-1].with_suffix("")): results[group[-1]] for group in groups}
+    columns = {labels[group[-1]]: results[group[-1]] for group in groups}
     facts = {
         "title": f"{suite}, {args.split} tasks" if not args.task else args.task,
         "episodes a task": args.episodes,

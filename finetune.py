@@ -116,7 +116,7 @@ def adapt_checkpoint(
     steps: int = 200,
     batch: int | None = None,
     learning_rates: dict[str, float] | None = None,
-    normalizer: str = "keep",
+    normalizer: str = "fit",
     seed: int = 0,
 ) -> dict[str, Any]:
     """Adapts the policy of a checkpoint to a task and writes the adapted one to `out`, a checkpoint like any other.
@@ -128,7 +128,7 @@ def adapt_checkpoint(
         steps, seed: as in `adapt_policy`.
         batch: windows a step; None: the preset's.
         learning_rates: changes to the default ones, by parameter group.
-        normalizer: `keep` the value ranges of the suite, or `fit` them to the demonstrations (Algorithm 2, line 3).
+        normalizer: `fit` the value ranges to the demonstrations (Algorithm 2, line 3), or `keep` those of the suite.
 
     Returns:
         The settings used, `seconds` spent on the steps, and `losses`, one a step.
@@ -184,7 +184,10 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=200, help="gradient steps (default: 200)")
     parser.add_argument("--batch", type=int, help="windows a step (default: paper 108, small 64, tiny 16)")
     parser.add_argument(
-        "--normalizer", choices=("keep", "fit"), default="keep", help="value ranges: of the suite, or fit"
+        "--normalizer",
+        choices=("fit", "keep"),
+        default="fit",
+        help="value ranges: the task's (default), or the suite's",
     )
     for part in LEARNING_RATES:
         parser.add_argument(f"--lr-{part}", type=float, help=f"learning rate of the {part} parameters")
