@@ -25,6 +25,7 @@ import http.client
 import math
 import os
 import pickle
+import shutil
 import urllib.request
 import warnings
 import zipfile
@@ -1022,7 +1023,10 @@ def save_checkpoint(path: str | Path, policy: DAMIPolicy, **info: Any) -> None:
         torch.save({"format": CHECKPOINT_FORMAT, "config": config, "model": policy.state_dict(), **info}, temporary)
         os.replace(temporary, path)
     except RuntimeError as error:  # how torch.save reports a full disk
-        raise OSError(f"cannot write {path}: {error}") from error
+        free = shutil.disk_usage(path.parent).free
+        raise OSError(
+            f"cannot write {path}: {free / 1e6:.1f} MB are free there; make room, or use another --out"
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -22,6 +22,7 @@ import sys
 import time
 from dataclasses import asdict, replace
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -131,17 +132,27 @@ def mean_loss_gradient(policy: DAMIPolicy, batches: list[dict[str, Tensor]]) -> 
 class StopRequest:
     """Turns the first Ctrl-C into a request to stop after the step at hand; the second one interrupts at once."""
 
-    def __init__(self) -> None:
+    def __enter__(self) -> "StopRequest":
         self.requested = False
         self.previous = signal.signal(signal.SIGINT, self.handle)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        signal.signal(signal.SIGINT, self.previous)
 
     def handle(self, *_: Any) -> None:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
 
-    def restore(self) -> None:
-        signal.signal(signal.SIGINT, self.previous)
+
+def not_finite(step: int, tasks: list[str], folder: Path) -> InputError:
+    """What to say when the loss or its gradient overflows; `tasks` are those to blame, if that is known."""
+    kept = f"; {folder}/last.pt keeps an earlier state" if (folder / "last.pt").exists() else ""
+    return InputError(
+        f"the loss or its gradient is not finite at step {step} (tasks: {', '.join(tasks) or 'all'}){kept}: "
+        "train again with a smaller --lr or --inner-lr, in another --out"
+    )
 
 
 def log(folder: Path, **values: Any) -> None:
@@ -307,91 +318,82 @@ def main(argv: list[str] | None = None) -> None:
         training = {"policy": policy.state_dict(), "n_averaged": ema.n_averaged, "optimizer": optimizer.state_dict()}
         save_checkpoint(folder / "last.pt", ema.module, **info, step=step, seconds=seconds, training=training)
 
+    measure = partial(
+        evaluate,
+        demonstrations=paths,
+        text=text,
+        episodes=settings["episodes"],
+        workers=args.workers,
+        device=device,
+        n_demonstrations=settings["demonstrations"],
+    )
+
     def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         return functional_call(policy, params, (), batch)
 
-    stop = StopRequest()
     first_order_steps = round(settings["first_order_share"] * settings["steps"])
     params = dict(policy.named_parameters())
     mine = list(enumerate(tasks))[rank::world]  # this process's share of the tasks
     n = settings["support"] + settings["query"]
     saved = time.monotonic()
-    progress = tqdm(
-        total=settings["steps"], initial=start, desc="training", unit="step", dynamic_ncols=True, disable=not leader
-    )
-    for step in range(start, settings["steps"]):
-        began = time.monotonic()
+    bar = {"desc": "training", "unit": "step", "dynamic_ncols": True, "disable": not leader}
+    with StopRequest() as stop, tqdm(total=settings["steps"], initial=start, **bar) as progress:
+        for step in range(start, settings["steps"]):
+            began = time.monotonic()
 
-        # One outer step (Algorithm 1, lines 3-21)
-        batches = (task_batch(policy, samplers[t], text[t], n, (args.seed, step, index)) for index, t in mine)
-        if args.maml == "off":
-            gradients, losses = mean_loss_gradient(policy, list(batches))
-        else:
-            pairs = (split(batch, settings["support"]) for batch in batches)
-            gradients, losses = meta_gradient(
-                loss_fn,
-                params,
-                pairs,
-                settings["inner_lr"],
-                first_order=args.maml == "first" or step < first_order_steps,
-                vectorize=settings["vectorize"],
-            )
-        loss = losses.mean()
-        if world > 1:  # the mean over all tasks is the mean of the processes' means, weighted by their shares
-            for x in (loss, *gradients.values()):
-                dist.all_reduce(x.mul_(len(mine) / len(tasks)))
-        norm = torch.nn.utils.get_total_norm(gradients.values())
-        if not torch.isfinite(loss + norm):
-            bad = [t for (_, t), value in zip(mine, losses) if not torch.isfinite(value)] if args.maml != "off" else []
-            progress.close()
-            kept = f"; {folder}/last.pt keeps an earlier state" if (folder / "last.pt").exists() else ""
-            raise InputError(
-                f"the loss or its gradient is not finite at step {step + 1} (tasks: {', '.join(bad) or 'all'}){kept}: "
-                "train again with a smaller --lr or --inner-lr, in another --out"
-            )
-        for name, parameter in params.items():
-            parameter.grad = gradients[name]
-        lr = learning_rate(step, settings["steps"], settings["lr"], settings["warmup"])
-        optimizer.param_groups[0]["lr"] = lr
-        optimizer.step()
-        ema.update_parameters(policy)
-        seconds += time.monotonic() - began
+            # One outer step (Algorithm 1, lines 3-21)
+            batches = (task_batch(policy, samplers[t], text[t], n, (args.seed, step, index)) for index, t in mine)
+            if args.maml == "off":
+                gradients, losses = mean_loss_gradient(policy, list(batches))
+            else:
+                pairs = (split(batch, settings["support"]) for batch in batches)
+                gradients, losses = meta_gradient(
+                    loss_fn,
+                    params,
+                    pairs,
+                    settings["inner_lr"],
+                    first_order=args.maml == "first" or step < first_order_steps,
+                    vectorize=settings["vectorize"],
+                )
+            loss = losses.mean()
+            if world > 1:  # the mean over all tasks is the mean of the processes' means, weighted by their shares
+                for x in (loss, *gradients.values()):
+                    dist.all_reduce(x.mul_(len(mine) / len(tasks)))
+            norm = torch.nn.utils.get_total_norm(gradients.values())
+            if not torch.isfinite(loss + norm):
+                bad = [t for (_, t), value in zip(mine, losses) if len(losses) == len(mine) and not value.isfinite()]
+                raise not_finite(step + 1, bad, folder)
+            for name, parameter in params.items():
+                parameter.grad = gradients[name]
+            lr = learning_rate(step, settings["steps"], settings["lr"], settings["warmup"])
+            optimizer.param_groups[0]["lr"] = lr
+            optimizer.step()
+            ema.update_parameters(policy)
+            seconds += time.monotonic() - began
 
-        # What it leaves behind
-        done = step + 1
-        if leader:
-            progress.update()
-            progress.set_postfix(loss=f"{loss:.4f}")
-            log(folder, step=done, loss=loss.item(), gradient_norm=norm.item(), lr=lr, seconds=round(seconds, 2))
-            final = done == settings["steps"]
-            milestone = final or done % settings["checkpoint_every"] == 0
-            if milestone:
-                checkpoint = folder / f"ema-{done:05d}.pt"
-                save_checkpoint(checkpoint, ema.module, **info, step=done, seconds=seconds)
-                if settings["episodes"] and (final or done % settings["evaluate_every"] == 0):
-                    successes = evaluate(
-                        checkpoint,
-                        paths,
-                        text,
-                        settings["episodes"],
-                        0,
-                        args.workers,
-                        device,
-                        settings["demonstrations"],
-                    )
-                    log(folder, step=done, success=mean_success(successes), successes=successes)
-                draw_curves(folder)
-            if milestone or stop.requested or time.monotonic() - saved > SAVE_SECONDS:
-                save_last(done)  # after the evaluation: a run killed in it comes back to it
-                saved = time.monotonic()
-        if stop.requested and done < settings["steps"]:
-            progress.close()
+            # What it leaves behind
+            done = step + 1
             if leader:
-                print(f"saved after step {done}: the same command with --resume goes on from there", file=sys.stderr)
-            stop.restore()
-            raise KeyboardInterrupt
-    progress.close()
-    stop.restore()
+                progress.update()
+                progress.set_postfix(loss=f"{loss:.4f}")
+                log(folder, step=done, loss=loss.item(), gradient_norm=norm.item(), lr=lr, seconds=round(seconds, 2))
+                final = done == settings["steps"]
+                milestone = final or done % settings["checkpoint_every"] == 0
+                if milestone:
+                    checkpoint = folder / f"ema-{done:05d}.pt"
+                    save_checkpoint(checkpoint, ema.module, **info, step=done, seconds=seconds)
+                    if settings["episodes"] and (final or done % settings["evaluate_every"] == 0):
+                        successes = measure(checkpoint)
+                        log(folder, step=done, success=mean_success(successes), successes=successes)
+                    draw_curves(folder)
+                if milestone or stop.requested or time.monotonic() - saved > SAVE_SECONDS:
+                    save_last(done)  # after the evaluation: a run killed in it comes back to it
+                    saved = time.monotonic()
+            if stop.requested and done < settings["steps"]:
+                if leader:
+                    progress.close()
+                    print(f"saved after step {done}: add --resume to go on from there", file=sys.stderr)
+                raise KeyboardInterrupt
     if world > 1:
         dist.destroy_process_group()
 
