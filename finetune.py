@@ -92,6 +92,7 @@ def adapt_policy(
         [{"params": groups[name], "lr": lr} for name, lr in learning_rates.items() if groups[name]],
         betas=(0.95, 0.999),
         weight_decay=weight_decay,
+        fused=True,
     )
     generator = torch.Generator().manual_seed(seed)
     for step in range(steps):

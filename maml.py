@@ -17,6 +17,7 @@ Nothing here knows what a policy is. A model enters as `params`, a dictionary of
 """
 
 from collections.abc import Callable, Iterable
+from itertools import islice
 from typing import Any
 
 import torch
@@ -48,7 +49,7 @@ def adapt(loss_fn: LossFn, params: Params, batch: Any, lr: float, steps: int = 1
     for _ in range(steps):
         start = {name: p.detach() for name, p in params.items()} if first_order else params
         gradient = grad(loss_fn)(start, batch)
-        params = {name: p - lr * gradient[name] for name, p in params.items()}
+        params = {name: torch.add(p, gradient[name], alpha=-lr) for name, p in params.items()}
     return params
 
 
@@ -59,26 +60,27 @@ def meta_gradient(
     lr: float,
     steps: int = 1,
     first_order: bool = False,
-    vectorize: bool = False,
+    vectorize: int = 1,
 ) -> tuple[Params, Tensor]:
     """Mean query loss over tasks, differentiated through each task's inner loop (Eq. 3; Algorithm 1, lines 4-19).
 
     Args:
         loss_fn: `(params, batch) -> ()`, pure.
         params: name -> tensor, the initialisation theta.
-        tasks: (support, query) batches, one pair a task. An iterator is read one task at a time, and the graph of a
-            task is freed before the next is read: memory does not grow with the number of tasks.
+        tasks: (support, query) batches, one pair a task. An iterator is read `vectorize` tasks at a time, and their
+            graph is freed before the next are read: memory does not grow with the number of tasks.
         lr, steps, first_order: as in `adapt`.
-        vectorize: run all tasks at once under `torch.vmap`. The same numbers, faster on a GPU, with memory for
-            all tasks; the batches of all tasks must have equal shapes and hold tensors only.
+        vectorize: so many tasks run at once, under `torch.vmap`: the same numbers, up to twice as fast, with memory for
+            all of these. Their batches must have equal shapes and hold tensors only.
 
     Returns:
         (gradients, losses): name -> tensor, and the query losses after adaptation, (tasks,), detached.
 
     Raises:
-        ValueError: `tasks` is empty.
+        ValueError: `tasks` is empty, or `vectorize` is less than 1.
     """
-
+    if vectorize < 1:
+        raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
     # Parameters that require grad would make autograd record all of this once more, beneath torch.func.
     params = {name: p.detach() for name, p in params.items()}
 
@@ -86,24 +88,20 @@ def meta_gradient(
         adapted = adapt(loss_fn, params, support, lr, steps, first_order)
         return loss_fn(adapted, query)
 
-    if vectorize:
-        tasks = list(tasks)
-        if not tasks:
-            raise ValueError("meta_gradient needs at least one task")
-        support, query = tree_map(lambda *leaves: torch.stack(leaves), *tasks)
-
-        def mean_query_loss(params: Params) -> tuple[Tensor, Tensor]:
+    def summed_query_loss(params: Params, tasks: list[tuple[Any, Any]]) -> tuple[Tensor, Tensor]:
+        if len(tasks) == 1:
+            losses = query_loss(params, *tasks[0])[None]  # (1,)
+        else:
+            support, query = tree_map(lambda *leaves: torch.stack(leaves), *tasks)
             losses = vmap(query_loss, in_dims=(None, 0, 0))(params, support, query)  # (tasks,)
-            return losses.mean(), losses
+        return losses.sum(), losses
 
-        gradients, (_, losses) = grad_and_value(mean_query_loss, has_aux=True)(params)
-        return gradients, losses.detach()
-
-    total, losses = None, []
-    for support, query in tasks:
-        gradients, loss = grad_and_value(query_loss)(params, support, query)
+    tasks, total, losses = iter(tasks), None, []
+    while chunk := list(islice(tasks, vectorize)):
+        gradients, (_, chunk_losses) = grad_and_value(summed_query_loss, has_aux=True)(params, chunk)
         total = gradients if total is None else {name: total[name].add_(g) for name, g in gradients.items()}
-        losses.append(loss.detach())
+        losses.append(chunk_losses.detach())
     if total is None:
         raise ValueError("meta_gradient needs at least one task")
-    return {name: g / len(losses) for name, g in total.items()}, torch.stack(losses)
+    losses = torch.cat(losses)  # (tasks,)
+    return {name: g / len(losses) for name, g in total.items()}, losses

@@ -56,7 +56,7 @@ SETTINGS = {
         "query": 88,  # windows a task for the outer loss
         "inner_lr": 1e-4,
         "first_order_share": 0.0,  # of the steps, the first ones; second order after them
-        "vectorize": False,  # all tasks at once; 258 M adapted parameters a task are too many
+        "vectorize": 1,  # tasks at once; 258 M adapted parameters a task are many
         "lr": 1e-4,
         "warmup": 500,
         "checkpoint_every": 3_600,  # outer steps: the paper's 200 epochs
@@ -70,7 +70,7 @@ SETTINGS = {
         "query": 24,
         "inner_lr": 1e-4,
         "first_order_share": 0.6,  # half the time a step, nearly the same gradient while the policy is still rough
-        "vectorize": True,
+        "vectorize": 10,
         "lr": 1e-3,
         "warmup": 50,
         "checkpoint_every": 140,
@@ -84,7 +84,7 @@ SETTINGS = {
         "query": 8,
         "inner_lr": 1e-3,
         "first_order_share": 0.0,
-        "vectorize": True,
+        "vectorize": 10,
         "lr": 3e-3,
         "warmup": 5,
         "checkpoint_every": 15,
@@ -215,12 +215,12 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     method.add_argument("--maml", choices=("second", "first", "off"), default="second", help="order (default: second)")
     method.add_argument("--demo-encoder", choices=("vmt", "mlp", "none"), help="encoder of the demonstration")
     method.add_argument("--tcfm", choices=("down", "mid", "up", "none"), help="the U-Net level that reads it")
-    method.add_argument("--vectorize", action=argparse.BooleanOptionalAction, help="all tasks at once under vmap")
     for name, kind, text in [
         ("steps", int, "outer steps"),
         ("support", int, "windows a task for the inner step"),
         ("query", int, "windows a task for the outer loss"),
         ("inner-lr", float, "learning rate of the inner step"),
+        ("vectorize", int, "tasks that run at once; memory is for so many"),
         ("first-order-share", float, "share of the steps that second-order MAML begins with in first order"),
         ("lr", float, "peak learning rate of AdamW"),
         ("warmup", int, "steps of linear warm-up"),
@@ -247,7 +247,7 @@ def main(argv: list[str] | None = None) -> None:
     settings = {
         name: value if (given := getattr(args, name)) is None else given for name, value in SETTINGS[preset].items()
     }
-    for name in ("steps", "support", "query", "checkpoint_every", "evaluate_every", "demonstrations"):
+    for name in ("steps", "support", "query", "vectorize", "checkpoint_every", "evaluate_every", "demonstrations"):
         if settings[name] < 1:
             raise InputError(f"--{name.replace('_', '-')} is {settings[name]}: use at least 1")
     if args.seed < 0:
@@ -275,7 +275,9 @@ def main(argv: list[str] | None = None) -> None:
     torch.manual_seed(args.seed)
     policy = DAMIPolicy(config).to(device)
     ema = ema_model(policy)
-    optimizer = torch.optim.AdamW(policy.parameters(), lr=settings["lr"], betas=(0.95, 0.999), weight_decay=1e-6)
+    optimizer = torch.optim.AdamW(
+        policy.parameters(), lr=settings["lr"], betas=(0.95, 0.999), weight_decay=1e-6, fused=True
+    )
     start, seconds, identity = 0, 0.0, None
     if args.resume and (folder / "last.pt").exists():
         averaged, state = load_checkpoint(folder / "last.pt", device)

@@ -13,9 +13,21 @@ from diffusers.models.embeddings import get_timestep_embedding
 import data
 import model
 from evaluate import window_sampler
-from model import PRESETS, DAMIPolicy, DiffusionSchedule, InputError, Normalizer, PolicyConfig
+from model import (
+    PRESETS,
+    Conv1d,
+    DAMIPolicy,
+    DiffusionSchedule,
+    InputError,
+    Normalizer,
+    PointNetEncoder,
+    PolicyConfig,
+    WinningPoints,
+)
+from tests.textbook import TextbookDP3
 
 TINY = PRESETS["tiny"]
+BATCH = ("points", "state", "action", "noise", "timesteps")  # what a policy reads that knows no task
 ABLATIONS = [("vmt", "down"), ("vmt", "mid"), ("vmt", "up"), ("mlp", "down"), ("none", "down"), ("none", "none")]
 
 
@@ -262,6 +274,48 @@ def test_the_order_of_a_clouds_points_changes_nothing():
         shuffled[name] = batch[name].gather(-2, order)
         assert not torch.equal(shuffled[name], batch[name])
     torch.testing.assert_close(sample(policy, shuffled), sample(policy, batch), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(5, 2, 40, 3), (40, 3)])
+def test_only_the_points_that_win_a_channel_are_differentiated_and_none_of_them_is_missing(shape):
+    torch.manual_seed(0)
+    pointnet, points = PointNetEncoder((8, 16), 4), torch.randn(shape)
+    pointnet(points).sum().backward()
+    sparse = [p.grad.clone() for p in pointnet.parameters()]
+    every = pointnet.mlp(points)  # (..., N, 16)
+    pointnet.zero_grad()
+    pointnet.projection(every.amax(dim=-2)).sum().backward()
+    torch.testing.assert_close(sparse, [p.grad for p in pointnet.parameters()])
+    clouds = points.view(-1, 40, 3)
+    indices = WinningPoints.apply(clouds, *pointnet.mlp.parameters())  # (clouds, K)
+    winners = [set(row.tolist()) for row in pointnet.mlp(clouds).argmax(dim=-2)]
+    assert all(won <= set(row.tolist()) for won, row in zip(winners, indices))
+    assert indices.shape[1] == max(map(len, winners)) < 40 // 2
+
+
+def test_the_policy_without_a_demonstration_is_the_textbooks_dp3():
+    policy = new_policy(demo_encoder="none", tcfm="none")
+    textbook = TextbookDP3(policy.config)
+    textbook.load_state_dict(policy.state_dict())
+    batch = {name: x for name, x in random_batch(policy.config, windows=20).items() if name in BATCH}
+    losses = policy.loss(**batch), textbook.loss(**batch)
+    torch.testing.assert_close(*losses, rtol=1e-5, atol=0)
+    gradients = [torch.autograd.grad(loss, list(p.parameters())) for loss, p in zip(losses, (policy, textbook))]
+    torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-6)
+
+
+def test_a_wide_convolution_written_as_a_matrix_product_is_a_convolution():
+    torch.manual_seed(0)
+    ours, torchs = Conv1d(1024, 1024, 5).double(), torch.nn.Conv1d(1024, 1024, 5, padding=2).double()
+    assert ours.wide and not Conv1d(64, 64, 5).wide
+    torchs.load_state_dict(ours.state_dict())
+    x = torch.randn(2, 1024, 4, dtype=torch.float64, requires_grad=True)
+    results = [layer(x) for layer in (ours, torchs)]
+    torch.testing.assert_close(*results)
+    cotangent = torch.randn_like(results[0])
+    torch.testing.assert_close(
+        *(torch.autograd.grad(y, [x, *layer.parameters()], cotangent) for y, layer in zip(results, (ours, torchs)))
+    )
 
 
 def test_a_demonstration_longer_than_the_positions_is_refused_with_both_numbers():

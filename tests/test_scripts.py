@@ -239,7 +239,7 @@ def test_every_way_of_training_learns_something_of_its_own(run, recorded, tmp_pa
     ways = {
         "first": ["--maml", "first"],
         "off": ["--maml", "off"],
-        "loop": ["--no-vectorize"],
+        "loop": ["--vectorize", "1"],
         "mlp": ["--demo-encoder", "mlp"],
         "dp3": ["--maml", "off", "--demo-encoder", "none", "--tcfm", "none"],
     }
