@@ -62,13 +62,13 @@ class UNet(nn.Module):
         c, levels = config.condition_dim, [config.action_dim, *config.unet_widths]
         self.timestep_mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.condition_mlp = nn.Sequential(nn.Linear(c, c), nn.Mish(), nn.Linear(c, c))
-        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        self.down, self.mid, self.up = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
         for i in range(1, len(levels)):
             inside = i < len(levels) - 1
             shrink = nn.Conv1d(levels[i], levels[i], 3, 2, 1) if inside else nn.Identity()
             first, second = ResidualBlock(levels[i - 1], levels[i], config), ResidualBlock(levels[i], levels[i], config)
             self.down.append(nn.ModuleList([first, second, shrink]))
-        self.mid = nn.ModuleList([ResidualBlock(levels[-1], levels[-1], config) for _ in range(2)])
+        self.mid.extend(ResidualBlock(levels[-1], levels[-1], config) for _ in range(2))
         for i in range(len(levels) - 1, 1, -1):
             first = ResidualBlock(2 * levels[i], levels[i - 1], config)
             second = ResidualBlock(levels[i - 1], levels[i - 1], config)
