@@ -734,9 +734,9 @@ class UnpairedUnifiedTask(nn.Module):
 
 
 class Conv1d(nn.Conv1d):
-    """A convolution over time that keeps the length; on a CPU a wide one is written as a matrix product.
+    """A convolution over time that keeps the length; a wide one, on a CPU, is written as a matrix product.
 
-    PyTorch's own (2.13) computes the gradient of a wide weight several times slower than its cost in operations.
+    PyTorch's own (2.13) takes up to eight times as long there for the gradient of the weight.
     """
 
     def __init__(self, d_in: int, d_out: int, kernel_size: int):
@@ -747,8 +747,9 @@ class Conv1d(nn.Conv1d):
         """(B, d_in, L) -> (B, d_out, L)."""
         if x.is_cuda or not self.wide:
             return super().forward(x)
-        windows = F.pad(x, (self.padding[0], self.padding[0])).unfold(-1, self.kernel_size[0], 1)  # (B, d_in, L, k)
-        windows = windows.transpose(1, 2).flatten(2)  # (B, L, d_in * k)
+        padded = F.pad(x, (self.padding[0], self.padding[0])).transpose(1, 2)  # (B, L + k - 1, d_in)
+        shifted = [padded[:, i : i + x.shape[-1]] for i in range(self.kernel_size[0])]  # k x (B, L, d_in)
+        windows = torch.stack(shifted, dim=-1).flatten(2)  # (B, L, d_in * k)
         return F.linear(windows, self.weight.flatten(1), self.bias).transpose(1, 2)
 
 

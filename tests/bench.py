@@ -1,35 +1,74 @@
-"""Times the pieces that matter, on this machine: `python -m tests.bench [--presets small tiny] [--repeat 5]`.
+"""Times the pieces that matter, on this machine, side by side: `python -m tests.bench [--paper]`.
 
-Each figure is the median of the repetitions, after one that is not counted. Nothing else should be running.
+Each figure is the median of the repetitions; what is compared takes turns, so that a slow minute of the machine meets
+all of it. The first round is not counted. Nothing else should be running.
 """
 
 import argparse
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch.func import functional_call
+from torch.utils.flop_counter import FlopCounterMode
 
-from data import Demonstrations, MetaWorldPointCloudEnv, demonstration_seed, farthest_point_sample, record_episode
-from evaluate import hardware, pick_device, window_sampler
+from data import (
+    Demonstrations,
+    MetaWorldPointCloudEnv,
+    WindowSampler,
+    demonstration_seed,
+    evaluation_seed,
+    farthest_point_sample,
+    record_episode,
+)
+from evaluate import EPISODES_A_JOB, hardware, pick_device, rollout, window_sampler
 from finetune import BATCH, adapt_policy
 from maml import meta_gradient
-from model import PRESETS, DAMIPolicy
+from model import PRESETS, DAMIPolicy, PolicyConfig
+from tests.textbook import TextbookDP3, training_step
 from train import SETTINGS, mean_loss_gradient, split, task_batch
 
+DP3 = {"demo_encoder": "none", "tcfm": "none"}
 
-def median_ms(f: Callable[[], object], repeat: int) -> float:
-    f()
-    times = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        f()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        times.append(1000 * (time.perf_counter() - start))
-    return statistics.median(times)
+
+def medians(functions: dict[str, Callable[[], object]], repeat: int) -> dict[str, float]:
+    """Milliseconds of each, taking turns."""
+    times = {name: [] for name in functions}
+    for _ in range(repeat + 1):
+        for name, function in functions.items():
+            start = time.perf_counter()
+            function()
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            times[name].append(1000 * (time.perf_counter() - start))
+    return {name: statistics.median(values[1:]) for name, values in times.items()}
+
+
+def step_medians(trainings: dict[str, Callable[[int], list[float]]], steps: int, rounds: int) -> dict[str, float]:
+    """Milliseconds a step of each training, taking turns; a training returns the time at the end of each of its steps."""
+    times = {name: [] for name in trainings}
+    for _ in range(rounds):
+        for name, training in trainings.items():
+            times[name] += np.diff(training(steps + 1)).tolist()
+    return {name: 1000 * statistics.median(values) for name, values in times.items()}
+
+
+def gflop(function: Callable[[], object]) -> float:
+    """Billions of operations in a call's matrix products and convolutions, a multiplication and an addition each."""
+    with FlopCounterMode(display=False) as counter:
+        function()
+    return counter.get_total_flops() / 1e9
+
+
+def matrix_rate(device: torch.device) -> float:
+    """The most this machine does: GFLOP a second in a square matrix product."""
+    x = torch.randn(2048, 2048, device=device)
+    return 2 * 2048**3 / 1e6 / medians({"product": lambda: x @ x}, 9)["product"]
 
 
 def frame_times(task: str, frames: int = 100) -> dict[str, float]:
@@ -60,65 +99,174 @@ def demonstration(task: str) -> Demonstrations:
     return Demonstrations(task, "bench", **arrays, episode_ends=np.array([len(arrays["action"])]), meta={})
 
 
-def preset_times(preset: str, recorded: Demonstrations, tasks: int, device: torch.device, repeat: int) -> list[float]:
-    """Milliseconds: outer step in second order, in first order, without MAML; adaptation step; control step; encoding."""
-    settings, config = SETTINGS[preset], PRESETS[preset]
-    torch.manual_seed(0)
-    policy = DAMIPolicy(config).to(device)
-    sampler = window_sampler(policy, recorded)
-    policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
-    text = torch.randn(config.text_dim, generator=torch.Generator().manual_seed(0)).to(device)
-    params = dict(policy.named_parameters())
-    n = settings["support"] + settings["query"]
-    batches = [task_batch(policy, sampler, text, n, (0, 0, task)) for task in range(tasks)]
-    pairs = [split(batch, settings["support"]) for batch in batches]
-    one = task_batch(policy, sampler, text, 1, (0, 0, 0))
-    adaptation_steps = 5
+class Bench:
+    """A fresh policy, one recorded episode, and the calls that train.py, finetune.py and evaluate.py make with them."""
 
-    def loss_fn(params, batch):
-        return functional_call(policy, params, (), batch)
+    def __init__(self, config: PolicyConfig, preset: str, recorded: Demonstrations, device: torch.device):
+        torch.manual_seed(0)
+        self.preset, self.settings = preset, SETTINGS[preset]
+        self.policy = DAMIPolicy(config).to(device)
+        self.sampler: WindowSampler = window_sampler(self.policy, recorded)
+        self.policy.normalizer.fit(self.sampler.points, self.sampler.state, self.sampler.action)
+        self.text = torch.randn(config.text_dim, generator=torch.Generator().manual_seed(0)).to(device)
 
-    def outer_step(first_order: bool):
-        return meta_gradient(loss_fn, params, pairs, settings["inner_lr"], 1, first_order, settings["vectorize"])
+    def batches(self, tasks: int) -> list[dict[str, torch.Tensor]]:
+        n = self.settings["support"] + self.settings["query"]
+        return [task_batch(self.policy, self.sampler, self.text, n, (0, 0, task)) for task in range(tasks)]
+
+    def outer_step(
+        self, batches: list[dict[str, torch.Tensor]], first_order: bool, vectorize: int | None = None
+    ) -> None:
+        meta_gradient(
+            lambda params, batch: functional_call(self.policy, params, (), batch),
+            dict(self.policy.named_parameters()),
+            (split(batch, self.settings["support"]) for batch in batches),
+            self.settings["inner_lr"],
+            first_order=first_order,
+            vectorize=vectorize or self.settings["vectorize"],
+        )
+
+    def one_by_one(self, batches: list[dict[str, torch.Tensor]]) -> None:
+        """Multi-task training without a batch over tasks."""
+        for batch in batches:
+            mean_loss_gradient(self.policy, [batch])
+
+    def adapt(self, steps: int) -> list[float]:
+        """The time at the end of each step of finetune.py."""
+        times = []
+        on_step = lambda *_: times.append(time.perf_counter())  # noqa: E731
+        adapt_policy(self.policy, self.sampler, self.text, steps, BATCH[self.preset], on_step=on_step)
+        return times
+
+    def textbook(self, steps: int) -> list[float]:
+        """The same for a textbook's training of the same network on the same windows."""
+        policy, average = (TextbookDP3(self.policy.config).to(self.text.device) for _ in range(2))
+        policy.load_state_dict(self.policy.state_dict())
+        optimizer = torch.optim.AdamW(policy.parameters(), lr=1e-4)
+        times, generator, n = [], torch.Generator().manual_seed(0), BATCH[self.preset]
+        for _ in range(steps):
+            batch = self.sampler.sample(n, generator) | self.policy.draw_noise(n, generator)
+            training_step(policy, average, optimizer, batch)
+            times.append(time.perf_counter())
+        return times
 
     @torch.no_grad()
-    def encode():
-        return policy.encode_demo(*(one[name] for name in ("text", "demo_points", "demo_state", "demo_action")))
+    def encode(self) -> tuple[torch.Tensor, ...] | None:
+        demo = {f"demo_{name}": x[None] for name, x in self.sampler.demonstration(0).items()}
+        return self.policy.encode_demo(self.text[None], **demo)
 
-    context = encode()
-    return [
-        median_ms(lambda: outer_step(first_order=False), repeat),
-        median_ms(lambda: outer_step(first_order=True), repeat),
-        median_ms(lambda: mean_loss_gradient(policy, batches), repeat),
-        median_ms(lambda: adapt_policy(policy, sampler, text, adaptation_steps, BATCH[preset]), repeat)
-        / adaptation_steps,
-        median_ms(lambda: policy.sample_actions(one["points"], one["state"], context), repeat),
-        median_ms(encode, repeat),
-    ]
+    def control(self) -> Callable[[], torch.Tensor]:
+        context, frames = self.encode(), self.sampler.gather(torch.tensor([100]))
+        return lambda: self.policy.sample_actions(frames["points"], frames["state"], context)
+
+
+def episode_seconds(task: str, device: torch.device, repeat: int) -> float:
+    """Seconds one core takes for one episode of 200 steps, `small`: as in evaluate.py, never successful (untrained)."""
+    bench = Bench(PRESETS["small"], "small", demonstration(task), device)
+    envs = [MetaWorldPointCloudEnv(task, bench.policy.config.num_points) for _ in range(EPISODES_A_JOB)]
+    seeds = [evaluation_seed(0, i) for i in range(EPISODES_A_JOB)]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    run = lambda: rollout(bench.policy.eval(), envs, seeds, bench.sampler, bench.text, torch.Generator())  # noqa: E731
+    milliseconds = medians({task: run}, repeat)[task]
+    torch.set_num_threads(threads)
+    return milliseconds / 1000 / EPISODES_A_JOB
+
+
+def peak_memory(tasks: int) -> float:
+    """GB that a process of its own holds at most for second-order outer steps of `small`."""
+    command = [sys.executable, "-m", "tests.bench", "--peak-memory", str(tasks)]
+    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
+
+
+def table(title: str, rows: dict[str, float], unit: str = "") -> None:
+    print(f"\n| {title} | |\n|---|---|")
+    for name, value in rows.items():
+        print(f"| {name} | {value:.{2 if value < 20 else 0}f}{unit} |", flush=True)
+
+
+def preset_table(bench: Bench, rate: float, repeat: int) -> None:
+    """Every kind of step of a preset, and how far it is from the machine's limit."""
+    batches, control = bench.batches(10), bench.control()
+    steps = {
+        "outer step, second order": lambda n=None: bench.outer_step(batches, first_order=False, vectorize=n),
+        "outer step, first order": lambda n=None: bench.outer_step(batches, first_order=True, vectorize=n),
+        "multi-task step, all windows in one batch": lambda: mean_loss_gradient(bench.policy, batches),
+        "multi-task step, one task at a time": lambda: bench.one_by_one(batches),
+    }
+    ms = medians(steps, repeat)
+    second, first, batch, single = ms.values()
+    ms |= step_medians({"adaptation step": bench.adapt}, steps=5, rounds=3)
+    ms |= medians({"control step": control, "encoding the demonstration": bench.encode}, repeat)
+    # Grouped convolutions, which vmap makes, are not counted rightly: outer steps are counted task by task.
+    counted = [lambda s=s: s(1) for s in list(steps.values())[:2]] + list(steps.values())[2:]
+    counted += [lambda: bench.adapt(1), control, bench.encode]
+    print(f"\n| `{bench.preset}`, 10 tasks | ms | GFLOP | of the matrix product's rate |\n|---|---|---|---|")
+    for (name, value), call in zip(ms.items(), counted):
+        operations = gflop(call)
+        print(f"| {name} | {value:.1f} | {operations:.2f} | {operations / value * 1000 / rate:.0%} |", flush=True)
+    ratios = {"first order": second / first, "one batch": second / batch, "one task at a time": second / single}
+    table(f"`{bench.preset}`: second order over", ratios)
 
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--presets", nargs="+", default=["small", "tiny"], choices=PRESETS, help="paper takes minutes")
+    parser.add_argument("--paper", action="store_true", help="the ratios at the paper's size too (10 minutes more, 16 GB)")
     parser.add_argument("--repeat", type=int, default=5)
-    parser.add_argument("--tasks", type=int, default=10, help="tasks an outer step (default: 10, as ML10)")
     parser.add_argument("--device")
+    parser.add_argument("--peak-memory", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     device = pick_device(args.device)
-    print(f"{hardware(device)}, torch {torch.__version__}, {torch.get_num_threads()} threads; milliseconds, median\n")
+    if args.peak_memory:
+        import resource
 
-    print("| frame, one core | physics | rays | sampling | all |\n|---|---|---|---|---|")
+        bench = Bench(PRESETS["small"], "small", demonstration("drawer-close"), device)
+        for _ in range(2):
+            bench.outer_step(bench.batches(args.peak_memory), first_order=False)
+        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
+        return
+    threads = torch.get_num_threads()
+    print(f"{hardware(device)}, torch {torch.__version__}, {threads} threads, {time.strftime('%Y-%m-%d')}")
+
+    print("\n| frame, one core, ms | physics | rays | sampling | all |\n|---|---|---|---|---|")
     for task in ("reach", "shelf-place", "basketball"):
         times = frame_times(task)
         cells = [f"{ms:.1f}" for ms in (*times.values(), sum(times.values()))]
         print(f"| {task} | {' | '.join(cells)} |", flush=True)
+    episodes = {task: episode_seconds(task, device, args.repeat) for task in ("reach", "shelf-place", "basketball")}
+    table("evaluation, one core, `small`: seconds an episode of 200 steps", episodes)
 
-    names = ["outer step, second order", "first order", "no MAML", "adaptation step", "control step", "demonstration"]
-    print(f"\n| {args.tasks} tasks | {' | '.join(names)} |\n|{'---|' * (len(names) + 1)}")
     recorded = demonstration("drawer-close")
-    for preset in args.presets:
-        times = preset_times(preset, recorded, args.tasks, device, args.repeat)
-        print(f"| {preset} | {' | '.join(f'{ms:.1f}' for ms in times)} |", flush=True)
+    rate = matrix_rate(device)
+    print(f"\nmatrix product: {rate:.0f} GFLOP a second")
+    for preset in ("small", "tiny"):
+        preset_table(Bench(PRESETS[preset], preset, recorded, device), rate, args.repeat)
+    table("`small`, second order, peak memory, GB", {f"{tasks} tasks": peak_memory(tasks) for tasks in (10, 20, 40)})
+
+    for preset, steps, rounds in (("small", 4, 5), ("paper", 2, 3)):
+        if preset == "paper" and not args.paper:
+            continue
+        dami = Bench(PRESETS[preset], preset, recorded, device)
+        dp3 = Bench(replace(PRESETS[preset], **DP3), preset, recorded, device)
+        ms = step_medians(
+            {"DAMI": dami.adapt, "DP3": dp3.adapt, "DP3 as a textbook writes it": dp3.textbook}, steps, rounds
+        )
+        table(f"`{preset}`, adaptation step, {BATCH[preset]} windows, ms", ms)
+        control = medians({"DAMI": dami.control(), "DP3": dp3.control()}, args.repeat)
+        table(f"`{preset}`, control step, ms", control)
+        ratios = {
+            "adaptation step, DAMI over DP3": ms["DAMI"] / ms["DP3"],
+            "control step, DAMI over DP3": control["DAMI"] / control["DP3"],
+            "training step of DP3, ours over the textbook's": ms["DP3"] / ms["DP3 as a textbook writes it"],
+        }
+        table(f"`{preset}`, ratios", ratios)
+        del dami, dp3
+    if args.paper:
+        bench = Bench(PRESETS["paper"], "paper", recorded, device)
+        batches = bench.batches(1)
+        orders = {"second order": False, "first order": True}
+        ms = medians({k: lambda f=f: bench.outer_step(batches, first_order=f) for k, f in orders.items()}, args.repeat)
+        table("`paper`, outer step, one task, s", {name: value / 1000 for name, value in ms.items()})
 
 
 if __name__ == "__main__":
