@@ -13,7 +13,6 @@ Ta=8 executed actions, A=4 action dim, S=9 state dim, R rays, M points before sa
 from __future__ import annotations
 
 import argparse
-import copy
 import difflib
 import json
 import multiprocessing
@@ -229,9 +228,6 @@ class RayCastCamera:
                 width = high[geoms, 0].max() - low[geoms, 0].min()
                 self.scenery[geoms] = width >= self.high[0] - self.low[0]
         self.objects = np.flatnonzero((model.geom_group <= 2) & ~self.scenery)
-        self.without_scenery, self.only_scenery = copy.copy(model), copy.copy(model)
-        self.without_scenery.geom_group[self.scenery] = 5  # a group that rays pass through
-        self.only_scenery.geom_group[~self.scenery] = 5
         rays = self.rays(pixels)  # (pixels**2, 3)
         with np.errstate(divide="ignore"):
             near, far = (self.low - self.origin) / rays, (self.high - self.origin) / rays  # (pixels**2, 3)
@@ -254,11 +250,11 @@ class RayCastCamera:
         rays: np.ndarray,
         cutoff: float = 1e3,
         sites: np.ndarray | None = None,
-        model: mujoco.MjModel | None = None,
+        geoms: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Cast unit `rays` (R, 3) from the camera at the geoms no farther than `cutoff` and at `sites` (None: all).
 
-        `model` says which geoms are visible (None: the camera's own).
+        `geoms` (geoms,) bool: at these alone, as far as they are visible (None: all).
 
         Returns the distances (R,) in metres, inf where nothing is hit, and what was hit (R,): a geom's index, -1 for
         nothing, or -2 - index of a site.
@@ -266,8 +262,13 @@ class RayCastCamera:
         count = len(rays)
         hit = np.full(count, -1, dtype=np.int32)
         distance = np.full(count, -1.0)
-        model = self.model if model is None else model
-        mujoco.mj_multiRay(model, data, self.origin, rays.ravel(), self.groups, 1, -1, hit, distance, count, cutoff)
+        groups = self.model.geom_group.copy()
+        if geoms is not None:
+            self.model.geom_group[~geoms] = 5  # rays pass through this one
+        mujoco.mj_multiRay(
+            self.model, data, self.origin, rays.ravel(), self.groups, 1, -1, hit, distance, count, cutoff
+        )
+        self.model.geom_group[:] = groups
         hit[distance < 0] = -1
         distance[distance < 0] = np.inf
         for site in self.sites if sites is None else sites:
@@ -309,10 +310,10 @@ class RayCastCamera:
         rays = self.all_rays[wanted.ravel() & self.meets]  # (R, 3)
 
         # The scenery comes last, since most rays meet it and no point of it is wanted: it only hides.
-        distance, _ = self.cast(data, rays, self.cutoff, self.sites[near[len(self.objects) :]], self.without_scenery)
+        distance, _ = self.cast(data, rays, self.cutoff, self.sites[near[len(self.objects) :]], ~self.scenery)
         points = self.origin + np.minimum(distance, 1e3)[:, None] * rays  # (R, 3)
         inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
-        barrier, _ = self.cast(data, rays[inside], self.cutoff, self.sites[:0], self.only_scenery)
+        barrier, _ = self.cast(data, rays[inside], self.cutoff, self.sites[:0], self.scenery)
         return points[inside][distance[inside] <= barrier].astype(np.float32)  # (M, 3)
 
     def depth(self, data: mujoco.MjData, pixels: int = CAMERA_PIXELS) -> np.ndarray:

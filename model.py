@@ -590,7 +590,7 @@ class WinningPoints(torch.autograd.Function):
     def indices(won: Tensor, channels: int) -> Tensor:
         """(..., N) int8 -> (..., K) int64: each cloud's winners, then others, up to the most winners in any cloud."""
         most = min(channels, won.shape[-1]) if won.is_cuda else int(won.sum(dim=-1).max())  # a GPU is not waited for
-        return won.argsort(dim=-1, descending=True)[..., :most]
+        return won.argsort(dim=-1, descending=True, stable=True)[..., :most]
 
 
 class PointNetEncoder(nn.Module):
@@ -754,7 +754,7 @@ class Conv1d(nn.Conv1d):
 
 
 class GroupNorm(nn.GroupNorm):
-    """Group normalization through `layer_norm`, whose second derivative takes half as many operations."""
+    """Group normalization through `layer_norm`, whose second derivative takes 40 % fewer operations under vmap."""
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, L) -> (B, C, L)."""

@@ -211,7 +211,9 @@ def preset_table(bench: Bench, rate: float, repeat: int) -> None:
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--paper", action="store_true", help="the ratios at the paper's size too (10 minutes more, 16 GB)")
+    parser.add_argument(
+        "--paper", action="store_true", help="the ratios at the paper's size too (10 minutes more, 16 GB)"
+    )
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--device")
     parser.add_argument("--peak-memory", type=int, help=argparse.SUPPRESS)
