@@ -609,7 +609,7 @@ class PointNetEncoder(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """(..., N, 3) float, normalized -> (..., feature_dim)."""
-        if torch.is_grad_enabled():
+        if torch.is_grad_enabled():  # the same feature and gradients as from all points, for less
             winners = WinningPoints.apply(points, *self.mlp.parameters())  # (..., K)
             points = points.gather(-2, winners[..., None].expand(*winners.shape, 3))  # (..., K, 3)
         x = self.mlp(points)  # (..., N, widths[-1]), or K for N
