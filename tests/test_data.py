@@ -93,6 +93,7 @@ SCENE = """
   <geom type="plane" size="5 5 1"/>
   <body><geom name="ball" type="sphere" size="0.3" pos="0.4 0.3 0.5"/></body>
   <body><geom name="cube" type="box" size="0.2 0.2 0.2" pos="-0.5 -0.3 0.2"/></body>
+  <body><geom name="hidden by the floor" type="sphere" size="0.1" pos="0.4 -0.4 -0.3"/></body>
   <geom type="box" size="0.2 0.2 0.2" pos="0 0 1.5" rgba="1 0 0 0" material="opaque"/>
   <geom type="box" size="0.2 0.2 0.2" pos="0 0 1.5" group="4"/>
   <site name="marker" type="sphere" size="0.1" pos="-0.4 0.4 0.6"/>
@@ -127,7 +128,7 @@ def test_points_are_those_rays_that_end_on_objects_in_the_workspace():
     model = mujoco.MjModel.from_xml_string(SCENE)
     physics = mujoco.MjData(model)
     mujoco.mj_forward(model, physics)
-    camera = RayCastCamera(model, 66, ((-1, -1, -0.01), (1, 1, 0.7)), "down", position=None)
+    camera = RayCastCamera(model, 66, ((-1, -1, -1), (1, 1, 0.7)), "down", position=None)
     points = camera.points(physics)
     rays = camera.rays(66)
     distance, hit = camera.cast(physics, rays)

@@ -167,6 +167,21 @@ def test_without_tasks_there_is_no_meta_gradient():
             )
 
 
+@pytest.mark.parametrize("vectorize, chunks", [(1, 5), (2, 3), (5, 1), (9, 1)])
+def test_as_many_tasks_run_at_once_as_asked_for(vectorize, chunks):
+    calls = []
+
+    def loss(params, batch):
+        calls.append(batch)
+        return ((params["x"] - batch) ** 2).sum()
+
+    tasks = [(torch.ones(1), torch.ones(1))] * 5
+    meta_gradient(loss, {"x": torch.zeros(1)}, tasks, 0.1, vectorize=vectorize)
+    assert len(calls) == 2 * chunks  # support and query
+    with pytest.raises(ValueError, match="vectorize is 0"):
+        meta_gradient(loss, {"x": torch.zeros(1)}, tasks, 0.1, vectorize=0)
+
+
 # --- Memory ----------------------------------------------------------------------------------------------------------
 
 
