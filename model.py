@@ -567,6 +567,7 @@ class WinningPoints(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor) -> tuple[Tensor, int]:
+        """`forward` for several tasks, one after the other; the indices (tasks, ..., K) have one K for all."""
         won = []
         for task in range(info.batch_size):
             points, *layers = (x if dim is None else x.select(dim, task) for x, dim in zip(inputs, in_dims))
@@ -581,7 +582,8 @@ class WinningPoints(torch.autograd.Function):
         winners = []
         for x in clouds.split(at_once):
             for weight, bias, norm_weight, norm_bias in zip(*(layers[i::4] for i in range(4))):
-                x = F.layer_norm(F.linear(x, weight, bias), bias.shape, norm_weight, norm_bias).relu_()
+                x = F.linear(x, weight, bias)  # (at_once, N, width)
+                x = F.layer_norm(x, bias.shape, norm_weight, norm_bias).relu_()
             winners.append(x.argmax(dim=-2))  # (at_once, widths[-1])
         won = torch.zeros(clouds.shape[:-1], dtype=torch.int8, device=points.device)
         return won.scatter_(-1, torch.cat(winners), 1).view(points.shape[:-1])
