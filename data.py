@@ -28,6 +28,7 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import zip_longest
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
@@ -582,24 +583,30 @@ def start_worker(stop, finished) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the starting process's business: it sets `stop`
 
 
-def record_episode(env: MetaWorldPointCloudEnv, seed: int, stop: Callable[[], bool] = lambda: False) -> dict | None:
-    """Let the expert act for one episode; return its arrays, or None if it never succeeded or `stop()` was true."""
+def record_episode(
+    env: MetaWorldPointCloudEnv, seed: int, stop: Callable[[], bool] = lambda: False
+) -> tuple[dict, int] | None:
+    """Let the expert act for one episode; return its arrays and the frame in which it first succeeded.
+
+    None if it never did, or `stop()` was true.
+    """
     env.begin(seed)
-    points, state, action, success = [], [], [], False
-    for _ in range(EPISODE_STEPS):
+    points, state, action, success = [], [], [], None
+    for frame in range(EPISODE_STEPS):
         if stop():
             return None
         observation = env.observe()
         points.append(observation["point_cloud"].astype(np.float16))
         state.append(observation["agent_pos"])
         action.append(env.expert_action())
-        success |= env.advance(action[-1])[2]["success"]
-    return {"points": points, "state": state, "action": action} if success else None
+        if env.advance(action[-1])[2]["success"] and success is None:
+            success = frame
+    return None if success is None else ({"points": points, "state": state, "action": action}, success)
 
 
 def collect_task(task: str, path: Path, episodes: int, seed: int) -> Path | None:
     """Record `episodes` successful episodes of one task into a file; in a worker process."""
-    start, frames, ends, seeds, attempt = time.perf_counter(), {}, [], [], 0
+    start, frames, ends, seeds, successes, attempt = time.perf_counter(), {}, [], [], [], 0
     env = MetaWorldPointCloudEnv(task, NUM_POINTS)
     while len(seeds) < episodes:
         if attempt >= ATTEMPTS_PER_EPISODE * episodes:
@@ -610,14 +617,16 @@ def collect_task(task: str, path: Path, episodes: int, seed: int) -> Path | None
             return None
         attempt += 1
         if episode is not None:
-            for field, values in episode.items():
+            for field, values in episode[0].items():
                 frames.setdefault(field, []).extend(values)
             ends.append(len(frames["action"]))
             seeds.append(episode_seed)
+            successes.append(episode[1])
             worker.finished.put(task)
     meta = RECIPE | {
         "seed": seed,
         "episode_seeds": seeds,
+        "success_frames": successes,
         "expert_success_rate": len(seeds) / attempt,
         "seconds": round(time.perf_counter() - start, 1),
         "versions": {package: version(package) for package in ("metaworld", "mujoco", "fpsample", "numpy")},
@@ -689,7 +698,8 @@ class WindowSampler:
     A window may begin n_obs_steps - 1 frames before an episode and end n_action_steps - 1 frames after it, the edge
     frames repeated: 193 windows in an episode of 200 frames. The clouds are held once, as float16, on `device`.
     Arguments: `num_points`, how many of each cloud's points are used (the first, a farthest point sample themselves);
-    `demo_stride`, every how many frames `demonstration` takes one.
+    `demo_stride`, every how many frames `demonstration` takes one; `after_success`, how many frames after its episode's
+    first success a window may begin, where the demonstrations' `meta` tells that frame (None: any number).
     """
 
     def __init__(
@@ -701,6 +711,7 @@ class WindowSampler:
         num_points: int = 512,
         demo_stride: int = 1,
         device: str | torch.device = "cpu",
+        after_success: int | None = None,
     ) -> None:
         if not 1 <= n_action_steps <= horizon - n_obs_steps + 1:
             raise InputError(
@@ -717,10 +728,13 @@ class WindowSampler:
         self.state = torch.tensor(demonstrations.state, dtype=torch.float32, device=device)  # (F, S)
         self.action = torch.tensor(demonstrations.action, dtype=torch.float32, device=device)  # (F, A)
         self.episodes = [demonstrations.episode(index) for index in range(len(demonstrations))]
+        successes = demonstrations.meta.get("success_frames", []) if after_success is not None else []
         windows = []
-        for episode in self.episodes:
+        for episode, success in zip_longest(self.episodes, successes[: len(self.episodes)]):
             first = episode.start - (n_obs_steps - 1)
             last = max(episode.stop - horizon + n_action_steps - 1, first)
+            if success is not None:
+                last = min(last, episode.start + success + after_success)
             frames = torch.arange(first, last + 1)[:, None] + torch.arange(horizon)  # (windows, H)
             windows.append(frames.clamp(episode.start, episode.stop - 1))
         self.windows = torch.cat(windows).to(device)  # (W, H) the frame of each action

@@ -48,6 +48,7 @@ from model import InputError as ModelInputError
 
 EPISODES_A_JOB = 10  # rolled out side by side in one process; part of the protocol, since it shapes the noise drawn
 PAPER_RESULTS = Path(__file__).parent / "assets" / "paper_results.json"
+SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
 
 Successes = dict[str, list[bool]]  # task -> one entry an episode
 
@@ -93,11 +94,14 @@ def pick_device(name: str | None) -> torch.device:
 
 
 def newest_checkpoint(runs: str | Path = "runs") -> Path:
-    """The last EMA checkpoint of the run that was written to last. Raises InputError if there is none."""
+    """The last EMA checkpoint of the run that was written to last; without any, the one of the repository, said so."""
     checkpoints = sorted(Path(runs).glob("*/ema-*.pt"), key=lambda path: (path.stat().st_mtime, path.name))
-    if not checkpoints:
+    if checkpoints:
+        return checkpoints[-1]
+    if not SHIPPED_CHECKPOINT.is_file():
         raise InputError(f"no checkpoint in {runs}/: run `python train.py --suite ml10` first, or name a --checkpoint")
-    return checkpoints[-1]
+    print(f"no checkpoint in {runs}/: using the one that comes with the code, {SHIPPED_CHECKPOINT.name}", flush=True)
+    return SHIPPED_CHECKPOINT
 
 
 def load_trained(path: str | Path, device: str | torch.device = "cpu") -> tuple[DAMIPolicy, dict[str, Any]]:
@@ -135,8 +139,12 @@ def text_features(instructions: Sequence[str], weights: str | None, identity: st
     return encoder.encode(list(instructions)), encoder.identity
 
 
-def window_sampler(policy: DAMIPolicy, demonstrations: Demonstrations) -> WindowSampler:
+def window_sampler(
+    policy: DAMIPolicy, demonstrations: Demonstrations, after_success: int | None = None
+) -> WindowSampler:
     """The sampler of one task's demonstrations with this policy's horizon, points and stride, on its device.
+
+    `after_success`: how many frames after an episode's first success a window may begin; None: any number.
 
     Raises InputError where policy and demonstrations disagree.
     """
@@ -155,6 +163,7 @@ def window_sampler(policy: DAMIPolicy, demonstrations: Demonstrations) -> Window
         config.num_points,
         config.demo_stride,
         device,
+        after_success,
     )
     longest = max(math.ceil((e.stop - e.start) / config.demo_stride) for e in sampler.episodes)
     if config.demo_encoder != "none" and longest > config.demo_positions:

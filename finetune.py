@@ -138,7 +138,7 @@ def adapt_checkpoint(
         InputError: checkpoint and demonstrations do not fit each other, or the loss is not finite.
     """
     policy, info = load_trained(checkpoint, text.device)
-    sampler = window_sampler(policy, demonstrations)
+    sampler = window_sampler(policy, demonstrations, info["arguments"].get("after_success"))
     if normalizer == "fit":
         policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
     scale = info["arguments"]["lr"] / PAPER_LEARNING_RATE

@@ -136,7 +136,7 @@ PRESETS = {
         demo_stride=16,
         demo_positions=13,
         timestep_dim=64,
-        unet_widths=(64, 128, 256),
+        unet_widths=(32, 64, 128),
     ),
     "tiny": PolicyConfig(
         num_points=64,
@@ -1101,13 +1101,19 @@ def ema_model(policy: DAMIPolicy) -> AveragedModel:
 CHECKPOINT_FORMAT = "DAMI checkpoint 1"
 
 
-def save_checkpoint(path: str | Path, policy: DAMIPolicy, **info: Any) -> None:
-    """Writes configuration, weights, normalizer and `info` (tensors and plain Python values) to one file, atomically."""
+def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **info: Any) -> None:
+    """Writes configuration, weights, normalizer and `info` (tensors and plain Python values) to one file, atomically.
+
+    `half`: the weights as float16, half the size (`load_checkpoint` gives float32 again); the normalizer stays float32.
+    """
     path = Path(path)
+    weights = policy.state_dict()
+    if half:
+        weights |= {name: parameter.detach().half() for name, parameter in policy.named_parameters()}
     config = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(policy.config).items()}
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        torch.save({"format": CHECKPOINT_FORMAT, "config": config, "model": policy.state_dict(), **info}, temporary)
+        torch.save({"format": CHECKPOINT_FORMAT, "config": config, "model": weights, **info}, temporary)
         os.replace(temporary, path)
     except RuntimeError as error:  # how torch.save reports a full disk
         free = shutil.disk_usage(path.parent).free

@@ -54,8 +54,9 @@ SETTINGS = {
         "steps": 54_000,
         "support": 20,  # windows a task for the inner step
         "query": 88,  # windows a task for the outer loss
+        "after_success": None,  # windows may begin anywhere in an episode
         "inner_lr": 1e-4,
-        "first_order_share": 0.0,  # of the steps, the first ones; second order after them
+        "multi_task_share": 0.0,  # of the steps, the first ones, without the inner step; MAML after them
         "vectorize": 1,  # tasks at once; 258 M adapted parameters a task are many
         "lr": 1e-4,
         "warmup": 500,
@@ -65,16 +66,17 @@ SETTINGS = {
         "demonstrations": 10,
     },
     "small": {
-        "steps": 1_400,
-        "support": 8,
-        "query": 24,
+        "steps": 6_000,
+        "support": 4,
+        "query": 12,
+        "after_success": 20,  # or at most so many frames after its first success: two thirds of the frames are later
         "inner_lr": 1e-4,
-        "first_order_share": 0.6,  # half the time a step, nearly the same gradient while the policy is still rough
+        "multi_task_share": 0.7,  # a quarter of the time a step, nearly the same gradient while the policy is rough
         "vectorize": 10,
         "lr": 1e-3,
-        "warmup": 50,
-        "checkpoint_every": 140,
-        "evaluate_every": 1_400,
+        "warmup": 100,
+        "checkpoint_every": 600,
+        "evaluate_every": 6_000,
         "episodes": 20,
         "demonstrations": 10,
     },
@@ -82,8 +84,9 @@ SETTINGS = {
         "steps": 30,
         "support": 4,
         "query": 8,
+        "after_success": 20,
         "inner_lr": 1e-3,
-        "first_order_share": 0.0,
+        "multi_task_share": 0.0,
         "vectorize": 10,
         "lr": 3e-3,
         "warmup": 5,
@@ -219,9 +222,10 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         ("steps", int, "outer steps"),
         ("support", int, "windows a task for the inner step"),
         ("query", int, "windows a task for the outer loss"),
+        ("after-success", int, "frames after an episode's first success in which a window may still begin"),
         ("inner-lr", float, "learning rate of the inner step"),
         ("vectorize", int, "tasks that run at once; memory is for so many"),
-        ("first-order-share", float, "share of the steps that second-order MAML begins with in first order"),
+        ("multi-task-share", float, "share of the steps that MAML begins with as multi-task training: no inner step"),
         ("lr", float, "peak learning rate of AdamW"),
         ("warmup", int, "steps of linear warm-up"),
         ("checkpoint-every", int, "steps between EMA checkpoints"),
@@ -250,6 +254,8 @@ def main(argv: list[str] | None = None) -> None:
     for name in ("steps", "support", "query", "vectorize", "checkpoint_every", "evaluate_every", "demonstrations"):
         if settings[name] < 1:
             raise InputError(f"--{name.replace('_', '-')} is {settings[name]}: use at least 1")
+    if (settings["after_success"] or 0) < 0:
+        raise InputError(f"--after-success is {settings['after_success']}: use at least 0")
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}: use 0 or more")
     changes = {"demo_encoder": args.demo_encoder, "tcfm": args.tcfm}
@@ -302,7 +308,7 @@ def main(argv: list[str] | None = None) -> None:
             module.normalizer.fit(**{name: torch.from_numpy(x) for name, x in every.items()})
     features, identity = text_features([d.instruction for d in demonstrations], args.clip_weights, identity)
     text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
-    samplers = {d.task: window_sampler(policy, d) for d in demonstrations}
+    samplers = {d.task: window_sampler(policy, d, settings["after_success"]) for d in demonstrations}
     info = {"suite": args.suite, "preset": preset, "text_weights": identity, "arguments": arguments}
     if leader and start == 0:
         (folder / "metrics.jsonl").unlink(missing_ok=True)
@@ -333,7 +339,8 @@ def main(argv: list[str] | None = None) -> None:
     def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         return functional_call(policy, params, (), batch)
 
-    first_order_steps = round(settings["first_order_share"] * settings["steps"])
+    share = 1.0 if args.maml == "off" else settings["multi_task_share"]
+    multi_task_steps = round(share * settings["steps"])
     params = dict(policy.named_parameters())
     mine = list(enumerate(tasks))[rank::world]  # this process's share of the tasks
     n = settings["support"] + settings["query"]
@@ -345,7 +352,7 @@ def main(argv: list[str] | None = None) -> None:
 
             # One outer step (Algorithm 1, lines 3-21)
             batches = (task_batch(policy, samplers[t], text[t], n, (args.seed, step, index)) for index, t in mine)
-            if args.maml == "off":
+            if step < multi_task_steps:
                 gradients, losses = mean_loss_gradient(policy, list(batches))
             else:
                 pairs = (split(batch, settings["support"]) for batch in batches)
@@ -354,7 +361,7 @@ def main(argv: list[str] | None = None) -> None:
                     params,
                     pairs,
                     settings["inner_lr"],
-                    first_order=args.maml == "first" or step < first_order_steps,
+                    first_order=args.maml == "first",
                     vectorize=settings["vectorize"],
                 )
             loss = losses.mean()
