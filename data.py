@@ -508,6 +508,9 @@ class Demonstrations:
                 f"{name}: lengths differ: {frames} frames of points, {len(self.state)} of state, "
                 f"{len(self.action)} of action, episode_ends up to {ends[-1]}"
             )
+        successes = self.meta.get("success_frames")
+        if successes is not None and (len(successes) < len(ends) or any(type(frame) is not int for frame in successes)):
+            raise InputError(f"{name}: success_frames must be a list with one whole number for each episode")
         for field in ("points", "state", "action"):
             if not np.isfinite(getattr(self, field)).all():
                 raise InputError(f"{name}: {field} holds NaN or infinite numbers: record or collect it again")

@@ -18,7 +18,9 @@ import math
 import multiprocessing
 import os
 import platform
+import shlex
 import signal
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -406,13 +408,27 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def write_report(folder: Path, columns: dict[str, Successes], facts: dict[str, Any], suite: str | None = None) -> str:
-    """Writes success.json (every episode, and how it was measured), success.md and success.png; returns the table."""
+def command(script: str, argv: Sequence[str] | None) -> str:
+    """The command line that a script was started with, for its report."""
+    return shlex.join(["python", script, *(sys.argv[1:] if argv is None else argv)])
+
+
+def write_report(
+    folder: Path,
+    columns: dict[str, Successes],
+    facts: dict[str, Any],
+    suite: str | None = None,
+    checkpoints: dict[str, Successes] | None = None,
+) -> str:
+    """Writes success.json (every episode, and how it was measured), success.md and success.png; returns the table.
+
+    `checkpoints`: what else was measured and is only kept in success.json.
+    """
     table = success_table(columns, suite)
     note = ", ".join(f"{name} {value}" for name, value in facts.items())
     text = f"{table}\n\nPercent of episodes, 95 % Wilson interval. {note}.\n"
     folder.mkdir(parents=True, exist_ok=True)
-    report = {"facts": facts, "successes": columns}
+    report = {"facts": facts, "successes": columns} | ({"checkpoints": checkpoints} if checkpoints else {})
     write_atomically(folder / "success.json", lambda temporary: temporary.write_text(json.dumps(report, indent=1)))
     write_atomically(folder / "success.md", lambda temporary: temporary.write_text(text))
     draw_success(columns, folder / "success.png", facts.get("title", "Success in Meta-World"), suite)
@@ -590,6 +606,7 @@ def main(argv: list[str] | None = None) -> None:
         "hardware": hardware(device),
         "text weights": identity,
         "date": time.strftime("%Y-%m-%d"),
+        "command": command("evaluate.py", argv),
     }
     for name, split in {"base": base, "novel": novel}.items():
         inside = [task for task in chosen if task in split]
@@ -599,7 +616,8 @@ def main(argv: list[str] | None = None) -> None:
             if args.top:
                 best = [float(np.mean(sorted(group)[-args.top :])) for group in means]
                 facts[f"{name} mean, best {args.top} checkpoints"] = mean_interval(best)
-    print(f"\n{write_report(out, columns, facts, suite)}\n")
+    every = {labels[checkpoint]: successes for checkpoint, successes in results.items()} if args.top else None
+    print(f"\n{write_report(out, columns, facts, suite, every)}\n")
     for name, value in facts.items():
         print(f"{name}: {value}")
 

@@ -33,6 +33,7 @@ from data import (
     load_demonstrations,
 )
 from evaluate import (
+    command,
     evaluate,
     hardware,
     load_trained,
@@ -249,6 +250,7 @@ def main(argv: list[str] | None = None) -> None:
         "seed": args.seed,
         "text weights": identity,
         "date": time.strftime("%Y-%m-%d"),
+        "command": command("finetune.py", argv),
     }
     print(f"\n{write_report(folder, columns, facts, info['suite'])}")
 

@@ -26,6 +26,7 @@ import math
 import os
 import pickle
 import shutil
+import sys
 import urllib.request
 import warnings
 import zipfile
@@ -1155,7 +1156,13 @@ def main(argv: list[str] | None = None) -> None:
     """Prints the modules, shapes and parameter counts of the presets. Weights are neither drawn nor stored."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--preset", choices=PRESETS, help="one preset, every parameter with its shape")
+    parser.add_argument("--half", nargs=2, metavar=("CHECKPOINT", "OUT"), help="copy a checkpoint, weights as float16")
     args = parser.parse_args(argv)
+    if args.half:
+        policy, info = load_checkpoint(args.half[0])
+        kept = {name: value for name, value in info.items() if name not in ("format", "training")}
+        save_checkpoint(args.half[1], policy, half=True, **kept)
+        return
     count = lambda module: sum(p.numel() for p in module.parameters())  # noqa: E731
     with torch.device("meta"):
         for preset in [args.preset] if args.preset else PRESETS:
@@ -1175,4 +1182,8 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (InputError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

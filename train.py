@@ -35,6 +35,7 @@ from tqdm import tqdm
 
 from data import InputError, WindowSampler, choose, collect, command_line, load_demonstrations, suite_tasks
 from evaluate import (
+    command,
     evaluate,
     hardware,
     mean_success,
@@ -69,7 +70,7 @@ SETTINGS = {
         "steps": 6_000,
         "support": 4,
         "query": 12,
-        "after_success": 20,  # or at most so many frames after its first success: two thirds of the frames are later
+        "after_success": 20,  # or at most so many frames after its first success: three in five frames are later
         "inner_lr": 1e-4,
         "multi_task_share": 0.7,  # a quarter of the time a step, nearly the same gradient while the policy is rough
         "vectorize": 10,
@@ -317,6 +318,7 @@ def main(argv: list[str] | None = None) -> None:
             "config": asdict(config),
             "text_weights": identity,
             "hardware": hardware(device),
+            "command": command("train.py", argv),
         }
         write_atomically(folder / "config.json", lambda temporary: temporary.write_text(json.dumps(written, indent=1)))
     elif leader:
@@ -417,6 +419,7 @@ def main(argv: list[str] | None = None) -> None:
                 "seed": args.seed,
                 "text weights": identity,
                 "date": time.strftime("%Y-%m-%d"),
+                "command": command("train.py", argv),
             }
             print(f"\n{write_report(folder, {'last checkpoint': successes}, facts, args.suite)}")
         print(f"\n{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")

@@ -95,7 +95,7 @@ def demonstration(task: str) -> Demonstrations:
     seed = 0
     while (episode := record_episode(env, demonstration_seed(0, seed))) is None:
         seed += 1
-    arrays = {name: np.stack(values) for name, values in episode.items()}
+    arrays = {name: np.stack(values) for name, values in episode[0].items()}
     return Demonstrations(task, "bench", **arrays, episode_ends=np.array([len(arrays["action"])]), meta={})
 
 

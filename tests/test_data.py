@@ -334,7 +334,8 @@ def test_stored_actions_replayed_with_the_stored_seed_reach_success(collected):
         observation, _ = env.reset(seed=seed)
         np.testing.assert_array_equal(observation["agent_pos"], demonstrations.state[frames][0])
         np.testing.assert_array_equal(observation["point_cloud"].astype(np.float16), demonstrations.points[frames][0])
-        assert any(env.advance(action)[2]["success"] for action in demonstrations.action[frames])
+        succeeded = [env.advance(action)[2]["success"] for action in demonstrations.action[frames]]
+        assert succeeded.index(True) == demonstrations.meta["success_frames"][index]
 
 
 def test_failed_attempts_are_not_kept():
@@ -483,6 +484,20 @@ def test_windows_equal_naive_slicing_of_the_padded_episodes():
         np.testing.assert_array_equal(batch["points"][window].numpy(), points)
         np.testing.assert_array_equal(batch["state"][window].numpy(), recorded.state[frames[:2]])
         np.testing.assert_array_equal(batch["action"][window].numpy(), recorded.action[frames])
+
+
+def test_windows_begin_up_to_so_many_frames_after_the_first_success():
+    recorded = replace(recording((40, 30)), meta={"success_frames": [10, 28]})
+    every, some = (WindowSampler(recorded, num_points=16, after_success=after) for after in (None, 5))
+    last = (40 - 16 + 7, 30 - 16 + 7)  # where the last window of each whole episode begins
+    assert len(every) == last[0] + 2 + last[1] + 2  # one begins a frame before the episode
+    assert len(some) == 15 + 2 + last[1] + 2  # in the second episode success comes after the last window
+    assert torch.equal(some.windows, torch.cat([every.windows[:17], every.windows[last[0] + 2 :]]))
+    assert len(WindowSampler(recording((40, 30)), num_points=16, after_success=5)) == len(every)  # no success told
+    assert len(WindowSampler(recorded.first(1), num_points=16, after_success=5)) == 17
+    for wrong in ([10], [10, "28"]):
+        with pytest.raises(InputError, match="success_frames must be"):
+            replace(recorded, meta={"success_frames": wrong}).check("reach.npz")
 
 
 def test_sampling_is_float32_repeatable_and_without_repetition():

@@ -422,6 +422,19 @@ def test_a_checkpoint_gives_back_policy_normalizer_and_information(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
 
 
+def test_a_half_precision_checkpoint_is_half_as_large_and_acts_nearly_alike(tmp_path):
+    policy = new_policy()
+    batch = random_batch(policy.config)
+    policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
+    for name, half in (("whole.pt", False), ("half.pt", True)):
+        model.save_checkpoint(tmp_path / name, policy, half=half)
+    again, _ = model.load_checkpoint(tmp_path / "half.pt")
+    assert (tmp_path / "half.pt").stat().st_size < 0.6 * (tmp_path / "whole.pt").stat().st_size
+    assert all(x.dtype == torch.float32 for x in again.state_dict().values())
+    assert all(torch.equal(a, b) for a, b in zip(again.normalizer.buffers(), policy.normalizer.buffers()))
+    torch.testing.assert_close(sample(again, batch), sample(policy, batch), atol=0.02, rtol=0)
+
+
 def bad_checkpoints(folder, good):
     """Path -> what the message must say."""
     raw = good.read_bytes()

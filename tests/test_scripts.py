@@ -253,6 +253,12 @@ def test_every_way_of_training_learns_something_of_its_own(run, recorded, tmp_pa
     assert first_step["loop"]["gradient_norm"] == pytest.approx(first_step["second"]["gradient_norm"], rel=1e-4)
     norms = {f"{line['gradient_norm']:.3g}" for name, line in first_step.items() if name != "loop"}
     assert len(norms) == 5
+    argv += ["--multi-task-share", "0.5"]  # the first of the two steps without the inner one
+    train.main(["--data", str(recorded), "--out", str(tmp_path / "annealed"), *argv])
+    annealed = metrics(tmp_path / "annealed")
+    assert annealed[0] == pytest.approx(first_step["off"] | {"seconds": annealed[0]["seconds"]})
+    train.main(["--data", str(recorded), "--out", str(tmp_path / "never"), *argv, "--maml", "off"])
+    assert annealed[1]["gradient_norm"] != pytest.approx(metrics(tmp_path / "never")[1]["gradient_norm"], rel=1e-3)
     names = weights(tmp_path / "dp3" / "last.pt")[0]
     assert not any(name.startswith(("u2t", "demo_encoder")) for name in names)
 
@@ -281,6 +287,22 @@ def test_two_processes_under_torchrun_train_as_one_does(recorded, tmp_path):
     moved = torch.cat([(one[name] - start[name]).flatten() for name in one if "normalizer" not in name])
     apart = torch.cat([(one[name] - two[name]).flatten() for name in one if "normalizer" not in name])
     assert apart.norm() < 1e-3 * moved.norm() and moved.norm() > 0.1
+
+
+def test_without_a_run_the_policy_that_comes_with_the_code_is_used(recorded, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    argv = ["--task", "door-close", "--data", str(recorded), "--demonstrations", "2", "--episodes", "0"]
+    finetune.main([*argv, "--steps", "1", "--batch", "4", "--device", "cpu"])
+    assert "no checkpoint in runs/: using the one that comes with the code, ml10-small.pt" in capsys.readouterr().out
+    info = weights("runs/finetune/door-close-seed0/adapted.pt")[1]
+    assert info["preset"] == "small" and info["arguments"]["maml"] == "second"
+    assert evaluate.SHIPPED_CHECKPOINT.stat().st_size < 16 * 2**20
+
+
+def test_without_any_policy_the_user_is_told_how_to_make_one(monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "SHIPPED_CHECKPOINT", Path("none.pt"))
+    for script, argv in ((evaluate, []), (finetune, ["--task", "shelf-place"])):
+        assert "no checkpoint in runs/: run `python train.py --suite ml10` first" in fails(script, argv, capsys)
 
 
 def test_finetuning_needs_only_a_task_and_reports_before_and_after(run, recorded, monkeypatch, capsys):
@@ -383,9 +405,8 @@ def test_a_rollout_can_be_watched(run, recorded, monkeypatch, capsys):
         (train, ["--preset", "tiny", "--tcfm", "none"], "set both to 'none'"),
         (finetune, ["--task", "shelf-plce"], "unknown task 'shelf-plce': did you mean 'shelf-place'?"),
         (finetune, ["--task", "shelf-place", "--steps", "0"], "--steps is 0: use at least 1"),
-        (finetune, ["--task", "shelf-place"], "no checkpoint in runs/"),
         (finetune, [], "name a Meta-World task with --task"),
-        (evaluate, [], "no checkpoint in runs/"),
+        (train, ["--preset", "tiny", "--after-success", "-1"], "--after-success is -1: use at least 0"),
         (evaluate, ["--checkpoint", "none.pt"], "no checkpoint at none.pt"),
         (evaluate, ["--episodes", "0"], "--episodes is 0: use at least 1"),
         (evaluate, ["--gif", "reach.gif"], "name its --task"),

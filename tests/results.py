@@ -1,0 +1,121 @@
+"""RESULTS.json, and what the README shows of it: tables and a chart.
+
+    python -m tests.results runs/seeds    # takes this report of evaluate.py into RESULTS.json
+    python -m tests.results               # writes the README's tables, draws the chart
+
+RESULTS.json keeps for each report every episode (1: success, 0: not), the command that measured it, hardware, seed and
+date; and for each training run that a report names its settings, command and time.
+"""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from data import suite_tasks
+from evaluate import Successes, format_success, mean_interval, mean_success, paper_success, write_atomically
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "RESULTS.json"
+BASE, NOVEL = suite_tasks("ml10")
+
+
+def take(results: dict, folder: Path) -> None:
+    """Adds the report in a folder of evaluate.py, and the training runs beside it, to `results`."""
+    report = json.loads((folder / "success.json").read_text())
+    for kind in ("successes", "checkpoints"):
+        for label, successes in report.get(kind, {}).items():
+            report[kind][label] = {task: "".join(str(int(s)) for s in episodes) for task, episodes in successes.items()}
+    results["evaluations"][folder.name] = report
+    for run in {label.split("/")[0] for label in report["successes"]}:
+        path = folder.parent / run
+        lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+        minutes = [line["seconds"] for line in lines if "loss" in line][-1] / 60
+        results["trainings"][run] = {"minutes": round(minutes, 1), **json.loads((path / "config.json").read_text())}
+
+
+def successes(results: dict, report: str, kind: str = "successes") -> dict[str, Successes]:
+    """Label -> task -> episodes of one report."""
+    return {
+        label: {task: [c == "1" for c in episodes] for task, episodes in tasks.items()}
+        for label, tasks in results["evaluations"][report].get(kind, {}).items()
+    }
+
+
+def only(results: Successes, tasks: list[str]) -> Successes:
+    return {task: results[task] for task in tasks}
+
+
+def seeds_table(results: dict, tasks: list[str], reports: dict[str, str]) -> str:
+    """A row a task: the seeds' episodes together, a column for each report; the means over seeds in the last row."""
+    lines = [f"| task | {' | '.join(reports)} | paper, DP3 | paper, DAMI |", "|---" * (len(reports) + 3) + "|"]
+    runs = {title: list(successes(results, report).values()) for title, report in reports.items()}
+    paper = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
+    dp3 = {task: (paper["base"] | paper["novel"])[task]["DP3"] for task in tasks}
+    for task in tasks:
+        pooled = [[s for run in columns for s in run[task]] for columns in runs.values()]
+        cells = [format_success(sum(episodes), len(episodes)) for episodes in pooled]
+        lines.append(f"| {task} | {' | '.join(cells)} | {dp3[task]:.1f} | {paper_success('ml10', task):.1f} |")
+    means = [mean_interval([mean_success(only(run, tasks)) for run in columns]) for columns in runs.values()]
+    ours = np.mean([paper_success("ml10", task) for task in tasks])
+    lines.append(f"| **mean** | {' | '.join(means)} | {np.mean(list(dp3.values())):.1f} | {ours:.1f} |")
+    return "\n".join(lines)
+
+
+TABLES = {
+    "base": lambda results: seeds_table(results, BASE, {"small": "seeds"}),
+    "novel": lambda results: seeds_table(results, NOVEL, {"small, 200 steps": "seeds"}),
+}
+
+
+def fill(readme: str, results: dict) -> str:
+    """The README with each table between its two comments as RESULTS.json has it."""
+    for name, table in TABLES.items():
+        pattern = rf"(<!-- results: {name} -->\n).*?(<!-- end -->)"
+        readme = re.sub(
+            pattern, lambda match, table=table: f"{match[1]}{table(results)}\n{match[2]}", readme, flags=re.S
+        )
+    return readme
+
+
+def draw(results: dict) -> None:
+    """assets/success.png."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(9, 3.4), layout="constrained")
+    tasks = BASE + NOVEL
+    runs = list(successes(results, "seeds").values())
+    rates = np.array([[100 * np.mean(run[task]) for task in tasks] for run in runs])  # (seeds, tasks)
+    x = np.arange(len(tasks)) + 0.5 * (np.arange(len(tasks)) >= len(BASE))
+    axes.bar(x - 0.2, rates.mean(0), 0.4, color="C0", label=f"small, mean of {len(runs)} seeds")
+    axes.plot(np.tile(x - 0.2, len(runs)), rates.ravel(), ".", color="k", markersize=4, label="each seed")
+    axes.bar(x + 0.2, [paper_success("ml10", task) for task in tasks], 0.4, color="0.75", label="paper (GPU, 258 M)")
+    axes.set_xticks(x, tasks, rotation=35, ha="right")
+    axes.set(ylabel="success, %", ylim=(0, 105))
+    axes.set_title("base tasks directly, novel tasks (right) after 200 steps", fontsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(frameon=False, ncols=3, loc="outside upper center", fontsize=8)
+    write_atomically(ROOT / "assets" / "success.png", lambda path: figure.savefig(path, dpi=110, format="png"))
+    plt.close(figure)
+
+
+def main(folders: list[str]) -> None:
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"trainings": {}, "evaluations": {}}
+    for folder in folders:
+        take(results, Path(folder))
+    if folders:
+        write_atomically(RESULTS, lambda path: path.write_text(json.dumps(results, indent=1) + "\n"))
+        return
+    readme = ROOT / "README.md"
+    filled = fill(readme.read_text(), results)
+    write_atomically(readme, lambda path: path.write_text(filled))
+    draw(results)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

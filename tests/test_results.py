@@ -1,0 +1,38 @@
+"""What the README claims is what RESULTS.json holds."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from evaluate import wilson_interval
+from tests.results import BASE, NOVEL, RESULTS, ROOT, fill
+
+README = (ROOT / "README.md").read_text()
+
+
+def test_the_tables_of_the_readme_are_those_of_the_results():
+    results = json.loads(RESULTS.read_text())
+    assert README.count("<!-- results: ") == 2 and fill(README, results) == README
+
+
+def test_a_cell_of_the_base_table_can_be_recomputed_from_the_episodes():
+    runs = json.loads(RESULTS.read_text())["evaluations"]["seeds"]["successes"]
+    assert len(runs) >= 2 and all(set(run) == {*BASE, *NOVEL} for run in runs.values())
+    episodes = "".join(run["reach"] for run in runs.values())
+    low, high = wilson_interval(episodes.count("1"), len(episodes))
+    row = re.search(r"^\| reach \| ([\d.]+) \[([\d.]+), ([\d.]+)\]", README, re.M)
+    expected = (episodes.count("1") / len(episodes), low, high)
+    assert [float(x) for x in row.groups()] == pytest.approx([100 * x for x in expected], abs=0.051)
+
+
+def test_every_result_says_how_it_was_measured():
+    results = json.loads(RESULTS.read_text())
+    for report in results["evaluations"].values():
+        assert {"command", "hardware", "seed", "date", "text weights"} <= set(report["facts"])
+        for label, run in report["successes"].items():
+            assert label.split("/")[0] in results["trainings"] and all(set(e) <= {"0", "1"} for e in run.values())
+            assert len({len(episodes) for episodes in run.values()}) == 1
+    for training in results["trainings"].values():
+        assert {"command", "hardware", "arguments", "minutes"} <= set(training) and np.isfinite(training["minutes"])
