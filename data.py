@@ -563,6 +563,12 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     return demonstrations
 
 
+def own_recordings(folder: str | Path) -> dict[str, Path]:
+    """Return task -> file of the recordings in a folder, if there are any and none is of a Meta-World task; else {}."""
+    paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
+    return {} if set(paths) & set(INSTRUCTIONS) else paths
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Collection with the scripted experts
 

@@ -4,6 +4,7 @@
     python train.py --suite ml10 --preset tiny                    # the same in a few minutes, to see it work
     python train.py --suite ml10 --resume                         # goes on where an interrupted run stopped
     python train.py --suite ml10 --maml off --demo-encoder none --tcfm none      # multi-task DP3
+    python train.py --data recordings                             # own tasks: every recording in that folder
     torchrun --nproc-per-node 4 train.py --suite ml10             # tasks shared among 4 processes
 
 One batch, from disk to the loss: `task_batch` here draws windows and a reference demonstration from a
@@ -33,7 +34,17 @@ from torch import Tensor
 from torch.func import functional_call
 from tqdm import tqdm
 
-from data import InputError, WindowSampler, choose, collect, command_line, load_demonstrations, suite_tasks
+from data import (
+    Demonstrations,
+    InputError,
+    WindowSampler,
+    choose,
+    collect,
+    command_line,
+    load_demonstrations,
+    own_recordings,
+    suite_tasks,
+)
 from evaluate import (
     command,
     evaluate,
@@ -46,7 +57,7 @@ from evaluate import (
     write_report,
 )
 from maml import meta_gradient
-from model import PRESETS, DAMIPolicy, ema_model, load_checkpoint, save_checkpoint
+from model import PRESETS, DAMIPolicy, PolicyConfig, ema_model, load_checkpoint, save_checkpoint
 from model import InputError as ModelInputError
 
 # What a preset means for training; the architecture of the same name is in model.PRESETS.
@@ -97,6 +108,7 @@ SETTINGS = {
         "demonstrations": 2,
     },
 }
+OWN_FRAMES = 500  # the paper's positions on the real robot
 SAVE_SECONDS = 60  # between two savings of last.pt: what a killed run loses at most
 WINDOW = ("points", "state", "action", "noise", "timesteps")  # the parts of a batch that have an entry a window
 
@@ -128,7 +140,10 @@ def split(batch: dict[str, Tensor], n_support: int) -> tuple[dict[str, Tensor], 
 
 def mean_loss_gradient(policy: DAMIPolicy, batches: list[dict[str, Tensor]]) -> tuple[dict[str, Tensor], Tensor]:
     """The gradient of ordinary multi-task training: all windows of all tasks in one batch, no inner step."""
-    loss = policy.loss(**{name: torch.cat([batch[name] for batch in batches]) for name in batches[0]})
+    if len({batch["demo_points"].shape for batch in batches}) == 1:
+        loss = policy.loss(**{name: torch.cat([batch[name] for batch in batches]) for name in batches[0]})
+    else:  # demonstrations of different lengths
+        loss = torch.stack([policy.loss(**batch) for batch in batches]).mean()
     gradients = torch.autograd.grad(loss, list(policy.parameters()))
     return dict(zip(dict(policy.named_parameters()), gradients)), loss.detach()[None]
 
@@ -148,6 +163,18 @@ class StopRequest:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
+
+
+def fit_config(config: PolicyConfig, demonstrations: list[Demonstrations]) -> PolicyConfig:
+    """The configuration with the dimensions of own recordings, and positions for their longest, or for 500 frames."""
+    longest = max((d.episode(i).stop - d.episode(i).start for d in demonstrations for i in range(len(d))), default=1)
+    return replace(
+        config,
+        state_dim=demonstrations[0].state.shape[1],
+        action_dim=demonstrations[0].action.shape[1],
+        num_points=min(config.num_points, *(d.points.shape[1] for d in demonstrations)),
+        demo_positions=math.ceil(max(longest, OWN_FRAMES) / config.demo_stride),
+    )
 
 
 def not_finite(step: int, tasks: list[str], folder: Path) -> InputError:
@@ -206,7 +233,9 @@ def draw_curves(folder: Path) -> None:
 def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Meta-train a DAMI policy on a Meta-World suite (Algorithm 1).")
     run = parser.add_argument_group("run")
-    run.add_argument("--suite", default="ml10", help="ml10 or ml45 (default: ml10)")
+    run.add_argument(
+        "--suite", help="ml10 or ml45 (default: ml10, or the recordings in --data if they are not Meta-World's)"
+    )
     run.add_argument("--preset", help="paper, small or tiny (default: paper on CUDA, small on a CPU)")
     run.add_argument("--data", default="data", help="folder of the demonstrations (default: data)")
     run.add_argument("--out", help="folder of the run (default: runs/SUITE-PRESET-seedSEED)")
@@ -232,7 +261,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         ("checkpoint-every", int, "steps between EMA checkpoints"),
         ("evaluate-every", int, "steps between evaluations"),
         ("episodes", int, "evaluation episodes a task; 0: never evaluate"),
-        ("demonstrations", int, "demonstrations a task"),
+        ("demonstrations", int, "demonstrations a task (of own recordings by default all)"),
+        ("num-points", int, "points of each cloud that the policy reads"),
     ]:
         method.add_argument(f"--{name}", type=kind, help=text)
     return parser.parse_args(argv)
@@ -259,10 +289,12 @@ def main(argv: list[str] | None = None) -> None:
         raise InputError(f"--after-success is {settings['after_success']}: use at least 0")
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}: use 0 or more")
-    changes = {"demo_encoder": args.demo_encoder, "tcfm": args.tcfm}
+    changes = {"demo_encoder": args.demo_encoder, "tcfm": args.tcfm, "num_points": args.num_points}
     config = replace(PRESETS[preset], **{name: value for name, value in changes.items() if value is not None})
-    tasks = suite_tasks(args.suite)[0]
-    folder = Path(args.out or f"runs/{args.suite}-{preset}-seed{args.seed}")
+    own = {} if args.suite else own_recordings(args.data)
+    suite = args.suite or ("own" if own else "ml10")
+    tasks = list(own) or suite_tasks(suite)[0]
+    folder = Path(args.out or f"runs/{suite}-{preset}-seed{args.seed}")
     if leader:
         print(f"preset {preset} on {device} ({hardware(device)}), {len(tasks)} tasks, run folder {folder}", flush=True)
 
@@ -271,14 +303,19 @@ def main(argv: list[str] | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / "last.pt").exists() and not args.resume:
             raise InputError(f"{folder} already holds a run: add --resume to go on with it, or choose another --out")
-        collect(tasks, args.data, settings["demonstrations"], workers=args.workers)
+        if not own:
+            collect(tasks, args.data, settings["demonstrations"], workers=args.workers)
     if world > 1:
         dist.barrier()
-    paths = {task: Path(args.data) / f"{task}.npz" for task in tasks}
+    paths = own or {task: Path(args.data) / f"{task}.npz" for task in tasks}
+    if own:  # no simulator to be rolled out in
+        settings |= {"demonstrations": args.demonstrations, "episodes": 0}
     demonstrations = [load_demonstrations(paths[task]).first(settings["demonstrations"]) for task in tasks]
+    if own:
+        config = fit_config(config, demonstrations)
 
     # The policy, or the state in which it was left
-    arguments = {"suite": args.suite, "preset": preset, "seed": args.seed, "maml": args.maml, **settings}
+    arguments = {"suite": suite, "preset": preset, "seed": args.seed, "maml": args.maml, **settings}
     torch.manual_seed(args.seed)
     policy = DAMIPolicy(config).to(device)
     ema = ema_model(policy)
@@ -309,8 +346,9 @@ def main(argv: list[str] | None = None) -> None:
             module.normalizer.fit(**{name: torch.from_numpy(x) for name, x in every.items()})
     features, identity = text_features([d.instruction for d in demonstrations], args.clip_weights, identity)
     text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
-    samplers = {d.task: window_sampler(policy, d, settings["after_success"]) for d in demonstrations}
-    info = {"suite": args.suite, "preset": preset, "text_weights": identity, "arguments": arguments}
+    after = settings["after_success"]
+    samplers = {task: window_sampler(policy, d, after) for task, d in zip(tasks, demonstrations)}
+    info = {"suite": suite, "preset": preset, "text_weights": identity, "arguments": arguments}
     if leader and start == 0:
         (folder / "metrics.jsonl").unlink(missing_ok=True)
         written = {
@@ -346,6 +384,8 @@ def main(argv: list[str] | None = None) -> None:
     params = dict(policy.named_parameters())
     mine = list(enumerate(tasks))[rank::world]  # this process's share of the tasks
     n = settings["support"] + settings["query"]
+    lengths = {len(range(e.start, e.stop, config.demo_stride)) for s in samplers.values() for e in s.episodes}
+    vectorize = settings["vectorize"] if len(lengths) == 1 else 1  # tasks at once need demonstrations of one length
     saved = time.monotonic()
     bar = {"desc": "training", "unit": "step", "dynamic_ncols": True, "disable": not leader}
     with StopRequest() as stop, tqdm(total=settings["steps"], initial=start, **bar) as progress:
@@ -364,7 +404,7 @@ def main(argv: list[str] | None = None) -> None:
                     pairs,
                     settings["inner_lr"],
                     first_order=args.maml == "first",
-                    vectorize=settings["vectorize"],
+                    vectorize=vectorize,
                 )
             loss = losses.mean()
             if world > 1:  # the mean over all tasks is the mean of the processes' means, weighted by their shares
@@ -413,7 +453,7 @@ def main(argv: list[str] | None = None) -> None:
     elif leader:
         if settings["episodes"]:
             facts = {
-                "title": f"{args.suite} base tasks, preset {preset}, step {settings['steps']}",
+                "title": f"{suite} base tasks, preset {preset}, step {settings['steps']}",
                 "episodes a task": settings["episodes"],
                 "training": f"{seconds / 60:.1f} min on {hardware(device)}",
                 "seed": args.seed,
@@ -421,7 +461,7 @@ def main(argv: list[str] | None = None) -> None:
                 "date": time.strftime("%Y-%m-%d"),
                 "command": command("train.py", argv),
             }
-            print(f"\n{write_report(folder, {'last checkpoint': successes}, facts, args.suite)}")
+            print(f"\n{write_report(folder, {'last checkpoint': successes}, facts, suite)}")
         print(f"\n{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
 
 

@@ -21,6 +21,7 @@ import data
 import evaluate
 import finetune
 import model
+import robot
 import train
 
 ROOT = Path(train.__file__).resolve().parent
@@ -466,14 +467,14 @@ def test_a_checkpoint_that_does_not_fit_is_refused_by_every_script(run, recorded
             assert message in fails(script, [*data_of, "--checkpoint", name], capsys)
 
 
-def own_recording(frames=200, action_dim=4, ends=None):
+def own_recording(frames=200, action_dim=4, ends=None, state_dim=9, task="stir"):
     """A user's recording of random numbers, not checked."""
     rng = np.random.default_rng(0)
     return {
-        "task": "stir",
+        "task": task,
         "instruction": "Stir the soup.",
         "points": rng.normal(size=(frames, 64, 3)).astype(np.float16),
-        "state": rng.normal(size=(frames, 9)).astype(np.float32),
+        "state": rng.normal(size=(frames, state_dim)).astype(np.float32),
         "action": rng.uniform(-1, 1, size=(frames, action_dim)).astype(np.float32),
         "episode_ends": np.array([frames] if ends is None else ends, dtype=np.int64),
         "meta": "{}",
@@ -503,6 +504,24 @@ def test_own_recordings_are_adapted_to_without_a_simulator(run, capsys):
     folder = Path("runs/finetune/stir-seed0")
     assert sorted(path.name for path in folder.iterdir()) == ["adapted.pt", "config.json", "metrics.jsonl"]
     assert "adapted in" in capsys.readouterr().out
+
+
+def test_own_recordings_of_any_length_and_dimension_are_trained_on_and_adapted_to(capsys):
+    Path("own").mkdir()
+    for task, ends in (("stir", [60, 90]), ("pour", [200, 350])):
+        recorded = own_recording(ends[-1], action_dim=7, ends=ends, state_dim=7, task=task)
+        np.savez(f"own/{task}.npz", **recorded)
+    argv = ["--preset", "tiny", "--steps", "2", "--checkpoint-every", "2", "--data", "own", "--clip-weights", "random"]
+    for name, options in {"maml": [], "off": ["--maml", "off"]}.items():
+        train.main([*argv, "--out", f"runs/{name}", *options])
+        policy, info = model.load_checkpoint(f"runs/{name}/ema-00002.pt")
+        config = policy.config
+        assert (config.state_dim, config.action_dim, config.demo_positions) == (7, 7, 25) and info["suite"] == "own"
+        assert not Path(f"runs/{name}/success.json").exists()
+    finetune.main(["--data", "own/pour.npz", "--checkpoint", "runs/maml/ema-00002.pt", "--steps", "2"])
+    assert weights("runs/finetune/pour-seed0/adapted.pt")[1]["adapted_to"] == "pour"
+    assert "own, base tasks" not in capsys.readouterr().out
+    assert "unknown suite 'own'" in fails(evaluate, ["--checkpoint", "runs/maml/ema-00002.pt"], capsys)
 
 
 def test_more_demonstrations_than_there_are_is_said(run, capsys):
@@ -549,7 +568,7 @@ def readme_commands():
             names = [
                 i
                 for i, word in enumerate(words)
-                if Path(word).name in ("train.py", "finetune.py", "evaluate.py", "data.py")
+                if Path(word).name in ("train.py", "finetune.py", "evaluate.py", "data.py", "robot.py")
             ]
             if names and words[0] in ("python", "torchrun"):
                 commands.append((Path(words[names[0]]).stem, words[names[0] + 1 :]))
@@ -558,6 +577,7 @@ def readme_commands():
 
 def test_the_readmes_commands_are_understood():
     commands = readme_commands()
-    assert {name for name, _ in commands} == {"train", "finetune", "evaluate", "data"}
+    scripts = {"train": train, "finetune": finetune, "evaluate": evaluate, "data": data, "robot": robot}
+    assert {name for name, _ in commands} == set(scripts)
     for name, arguments in commands:
-        {"train": train, "finetune": finetune, "evaluate": evaluate, "data": data}[name].parse(arguments)
+        scripts[name].parse(arguments)
