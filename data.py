@@ -509,7 +509,8 @@ class Demonstrations:
                 f"{len(self.action)} of action, episode_ends up to {ends[-1]}"
             )
         successes = self.meta.get("success_frames")
-        if successes is not None and (len(successes) < len(ends) or any(type(frame) is not int for frame in successes)):
+        listed = isinstance(successes, list) and all(type(frame) is int and frame >= 0 for frame in successes)
+        if successes is not None and not (listed and len(successes) >= len(ends)):
             raise InputError(f"{name}: success_frames must be a list with one whole number for each episode")
         for field in ("points", "state", "action"):
             if not np.isfinite(getattr(self, field)).all():

@@ -96,7 +96,10 @@ def pick_device(name: str | None) -> torch.device:
 
 
 def newest_checkpoint(runs: str | Path = "runs") -> Path:
-    """The last EMA checkpoint of the run that was written to last; without any, the one of the repository, said so."""
+    """The last EMA checkpoint of the run that was written to last; without any, the one of the repository, said so.
+
+    Raises InputError if that is missing, too.
+    """
     checkpoints = sorted(Path(runs).glob("*/ema-*.pt"), key=lambda path: (path.stat().st_mtime, path.name))
     if checkpoints:
         return checkpoints[-1]

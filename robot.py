@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import select
 import socket
 import struct
@@ -64,7 +65,7 @@ class RobotError(InputError):
 class Settings:
     """What the JSON file of --config holds. Lengths are in metres, angles in radians, frames the robot's base.
 
-    The first four have no default: they belong to the place where the arm stands.
+    The first five have no default: they belong to the place where the arm stands.
     """
 
     tcp_low_m: tuple[float, ...]  # (3,) the box that the TCP stays in
@@ -167,10 +168,7 @@ FORMATS = {
     "UINT32": "I",
     "UINT64": "Q",
     "DOUBLE": "d",
-    "VECTOR3D": "3d",
     "VECTOR6D": "6d",
-    "VECTOR6INT32": "6i",
-    "VECTOR6UINT32": "6I",
 }
 OUTPUTS = (
     "timestamp",
@@ -434,7 +432,7 @@ def dashboard(host: str, port: int, *questions: str) -> list[str]:
 # ---- Gripper: AG95 over Modbus RTU -----------------------------------------------------------------------------------
 
 INITIALIZE, FORCE, POSITION = 0x0100, 0x0101, 0x0103
-INITIALIZED, GRIP, POSITION_NOW = 0x0200, 0x0201, 0x0202
+INITIALIZED, POSITION_NOW = 0x0200, 0x0202
 READ, WRITE = 3, 6
 EXCEPTIONS = {1: "unknown function", 2: "unknown register", 3: "value refused", 4: "device failure"}
 
@@ -592,9 +590,9 @@ def cloud(depth: np.ndarray, intrinsics: Intrinsics, settings: Settings) -> np.n
 
 
 class RealSense:
-    """The depth stream of a RealSense camera, with that stream's own intrinsics.
+    """The depth stream of the first RealSense camera found, with that stream's own intrinsics.
 
-    `device`: a pyrealsense2 device to take instead of the first one found (a `software_device`, in tests).
+    Raises InputError without pyrealsense2, RobotError if the camera does not start.
     """
 
     def __init__(self, width: int = 640, height: int = 480, hz: int = 30):
@@ -766,6 +764,8 @@ class Servo:
         """Stops the arm; the first reason is kept."""
         if self.error is None:
             self.error = reason
+        if not self.moves:
+            return  # nothing was sent, and nothing can be
         try:
             self.rtde.stop(self.pose)
         except RobotError:
@@ -806,8 +806,8 @@ class Servo:
                 pose = self.tick(now)
                 if self.moves:
                     self.rtde.send(pose)
-            except RobotError as error:
-                self.fail(str(error))
+            except Exception as error:  # whatever it is: without this thread the arm must not go on
+                self.fail(str(error) if isinstance(error, RobotError) else f"the stream broke off: {error!r}")
                 return
             self.lateness.append(now - due)
             self.ages.append(state.age)
@@ -819,8 +819,7 @@ class Servo:
         self.ended.set()
         if hasattr(self, "thread"):
             self.thread.join(1.0)
-        if self.moves:
-            self.fail(self.error or "stopped")
+        self.fail("stopped")
 
     def report(self) -> str:
         """How regular the stream was."""
@@ -927,7 +926,7 @@ def execute(
 
 
 class Keys:
-    """The keys pressed so far, one at a time, without waiting; of a terminal without Enter, else of lines of stdin."""
+    """The keys pressed so far, one at a time, without waiting: of a terminal, without Enter, or of what stdin brings."""
 
     def __enter__(self) -> Keys:
         self.old = termios.tcgetattr(sys.stdin) if sys.stdin.isatty() else None
@@ -940,13 +939,14 @@ class Keys:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self.old)
 
     def pressed(self) -> str:
-        """One key, or an empty string."""
-        if not select.select([sys.stdin], [], [], 0)[0]:
-            return ""
-        key = sys.stdin.read(1) if self.old is not None else sys.stdin.readline()[:1]
-        if key == "" and self.old is None:
-            raise RobotError("the input has ended: the episode at hand is dropped")
-        return key
+        """One key, or an empty string. Raises RobotError at the end of the input."""
+        while select.select([sys.stdin], [], [], 0)[0]:
+            key = os.read(sys.stdin.fileno(), 1).decode("ascii", "replace")  # past Python's buffer, which hides keys
+            if key == "":
+                raise RobotError("the input has ended: the episode at hand is dropped")
+            if key != "\n":
+                return key
+        return ""
 
 
 def to_demonstrations(task: str, instruction: str, episodes: list[list[tuple]], meta: dict) -> Demonstrations:

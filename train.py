@@ -287,6 +287,8 @@ def main(argv: list[str] | None = None) -> None:
             raise InputError(f"--{name.replace('_', '-')} is {settings[name]}: use at least 1")
     if (settings["after_success"] or 0) < 0:
         raise InputError(f"--after-success is {settings['after_success']}: use at least 0")
+    if args.num_points is not None and args.num_points < 1:
+        raise InputError(f"--num-points is {args.num_points}: use at least 1")
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}: use 0 or more")
     changes = {"demo_encoder": args.demo_encoder, "tcfm": args.tcfm, "num_points": args.num_points}

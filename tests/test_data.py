@@ -495,7 +495,7 @@ def test_windows_begin_up_to_so_many_frames_after_the_first_success():
     assert torch.equal(some.windows, torch.cat([every.windows[:17], every.windows[last[0] + 2 :]]))
     assert len(WindowSampler(recording((40, 30)), num_points=16, after_success=5)) == len(every)  # no success told
     assert len(WindowSampler(recorded.first(1), num_points=16, after_success=5)) == 17
-    for wrong in ([10], [10, "28"]):
+    for wrong in ([10], [10, "28"], [10, -1], 10):
         with pytest.raises(InputError, match="success_frames must be"):
             replace(recorded, meta={"success_frames": wrong}).check("reach.npz")
 

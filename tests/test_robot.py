@@ -638,6 +638,22 @@ def test_a_dry_run_does_everything_but_motion(emulator, cell, capsys):
     np.testing.assert_allclose(emulator.pose, START_POSE)
 
 
+def test_trouble_in_a_dry_run_ends_it_with_the_reason_and_sends_nothing(emulator, cell, capsys):
+    robot_policy("policy.pt")
+    threading.Timer(1.5, lambda: setattr(emulator.faults, "safety_mode", 3)).start()
+    argv = ["run", *cell, "--checkpoint", "policy.pt", "--data", "demos.npz", "--seconds", "20", "--dry-run"]
+    assert ends(argv) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "protective stop" in error and emulator.received == []
+
+
+def test_keys_that_arrive_together_are_all_read(monkeypatch):
+    Typing(monkeypatch, (0.0, "s\ne"))
+    time.sleep(0.1)
+    with robot.Keys() as keys:
+        assert [keys.pressed() for _ in range(3)] == ["s", "e", ""]
+
+
 def test_a_stop_while_running_ends_the_command_with_the_reason(emulator, cell, capsys):
     robot_policy("policy.pt")
     threading.Timer(1.5, lambda: setattr(emulator.faults, "safety_mode", 3)).start()

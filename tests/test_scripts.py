@@ -408,6 +408,7 @@ def test_a_rollout_can_be_watched(run, recorded, monkeypatch, capsys):
         (finetune, ["--task", "shelf-place", "--steps", "0"], "--steps is 0: use at least 1"),
         (finetune, [], "name a Meta-World task with --task"),
         (train, ["--preset", "tiny", "--after-success", "-1"], "--after-success is -1: use at least 0"),
+        (train, ["--preset", "tiny", "--num-points", "0"], "--num-points is 0: use at least 1"),
         (evaluate, ["--checkpoint", "none.pt"], "no checkpoint at none.pt"),
         (evaluate, ["--episodes", "0"], "--episodes is 0: use at least 1"),
         (evaluate, ["--gif", "reach.gif"], "name its --task"),
