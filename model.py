@@ -914,14 +914,16 @@ class Normalizer(nn.Module):
     def fit(self, points: Tensor, state: Tensor, action: Tensor) -> None:
         """Sets the ranges from data: points (..., 3), state (..., S), action (..., A).
 
-        A coordinate that hardly moves (range under 1e-4) is centred and not stretched.
+        A coordinate that hardly moves (range under 1e-4) is centred and not stretched; of an action it is, since what
+        is drawn from [-1, 1] must come back as what the demonstrations did.
         """
         for name, data in {"points": points, "state": state, "action": action}.items():
             data = data.flatten(0, -2).float()
             low, high = data.amin(0), data.amax(0)
             half = (high - low) / 2
             getattr(self, f"{name}_center").copy_((low + high) / 2)
-            getattr(self, f"{name}_scale").copy_(torch.where(half < 5e-5, torch.ones_like(half), half))
+            constant = 5e-5 if name == "action" else 1.0
+            getattr(self, f"{name}_scale").copy_(torch.where(half < 5e-5, constant, half))
 
     def normalize(self, name: str, x: Tensor) -> Tensor:
         """x (..., dim) in its own unit -> [-1, 1]; `name` is points, state or action."""

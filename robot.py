@@ -58,6 +58,10 @@ class RobotError(InputError):
     """Arm, gripper or camera cannot go on; the message says why. The arm has been stopped."""
 
 
+class CameraError(RobotError):
+    """The camera gives no usable cloud. While the policy runs the arm is held, and stopped after `max_hold_s`."""
+
+
 # ---- Settings --------------------------------------------------------------------------------------------------------
 
 
@@ -74,6 +78,7 @@ class Settings:
     crop_high_m: tuple[float, ...]  # (3,)
     camera_to_base: tuple[tuple[float, ...], ...]  # (4, 4) pose of the camera, rotation and translation in metres
     outside_box: str = "stop"  # or "clamp": what happens to a target outside the box
+    rotation_near_rad: tuple[float, ...] = (0.0, 3.14159, 0.0)  # (3,) of a state's two rotation vectors, the nearer one
     num_points: int = 1024
     policy_hz: float = 10.0  # observations and actions a second
     servo_hz: float = 125.0
@@ -96,10 +101,10 @@ class Settings:
         def refuse(name: str, why: str) -> None:
             raise InputError(f"{name} in the robot's settings is {getattr(self, name)!r}: {why}")
 
-        for name in ("tcp_low_m", "tcp_high_m", "crop_low_m", "crop_high_m"):
+        for name in ("tcp_low_m", "tcp_high_m", "crop_low_m", "crop_high_m", "rotation_near_rad"):
             value = np.array(getattr(self, name), dtype=float)
             if value.shape != (3,) or not np.isfinite(value).all():
-                refuse(name, "give three numbers in metres")
+                refuse(name, f"give three numbers in {'radians' if name.endswith('_rad') else 'metres'}")
         for low, high in (("tcp_low_m", "tcp_high_m"), ("crop_low_m", "crop_high_m")):
             if not (np.array(getattr(self, low)) < np.array(getattr(self, high))).all():
                 refuse(low, f"each number must be below that of {high}")
@@ -574,16 +579,16 @@ def depth_to_points(depth: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
 def cloud(depth: np.ndarray, intrinsics: Intrinsics, settings: Settings) -> np.ndarray:
     """Depth (H, W) in metres -> the policy's points (N, 3) float32, base frame, cropped and farthest point sampled.
 
-    Fewer points than N are repeated. Raises RobotError if there is no depth, or none of it inside the box.
+    Fewer points than N are repeated. Raises CameraError if there is no depth, or none of it inside the box.
     """
     points = depth_to_points(depth, intrinsics)
     if len(points) == 0:
-        raise RobotError("the camera's depth is empty: check its cable, its power and what it looks at")
+        raise CameraError("the camera's depth is empty: check its cable, its power and what it looks at")
     pose = np.array(settings.camera_to_base)
     points = (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)  # (M, 3) base frame
     inside = ((points >= settings.crop_low_m) & (points <= settings.crop_high_m)).all(axis=1)
     if not inside.any():
-        raise RobotError(
+        raise CameraError(
             "no point of the camera lies in the crop box: check camera_to_base and crop_low_m, crop_high_m"
         )
     return farthest_point_sample(points[inside], settings.num_points)
@@ -592,7 +597,7 @@ def cloud(depth: np.ndarray, intrinsics: Intrinsics, settings: Settings) -> np.n
 class RealSense:
     """The depth stream of the first RealSense camera found, with that stream's own intrinsics.
 
-    Raises InputError without pyrealsense2, RobotError if the camera does not start.
+    Raises InputError without pyrealsense2, CameraError if the camera does not start.
     """
 
     def __init__(self, width: int = 640, height: int = 480, hz: int = 30):
@@ -607,16 +612,16 @@ class RealSense:
         try:
             profile = self.pipeline.start(config)
         except RuntimeError as error:
-            raise RobotError(f"the RealSense camera does not start: {error}") from None
+            raise CameraError(f"the RealSense camera does not start: {error}") from None
         self.unit = profile.get_device().first_depth_sensor().get_depth_scale()  # metres
         self.intrinsics = realsense_intrinsics(profile.get_stream(rs.stream.depth))
 
     def read(self) -> np.ndarray:
-        """The newest depth image (H, W) float32 in metres. Raises RobotError after a second without one."""
+        """The newest depth image (H, W) float32 in metres. Raises CameraError after a second without one."""
         try:
             frames = self.pipeline.wait_for_frames(1000)
         except RuntimeError as error:
-            raise RobotError(f"the RealSense camera: {error}") from None
+            raise CameraError(f"the RealSense camera: {error}") from None
         return np.asarray(frames.get_depth_frame().get_data()).astype(np.float32) * self.unit
 
     def close(self) -> None:
@@ -666,6 +671,16 @@ def difference(pose: np.ndarray, later: np.ndarray) -> np.ndarray:
     return np.concatenate([later[:3] - pose[:3], rotation.as_rotvec()])
 
 
+def nearer(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Of the two vectors (3,), of angles a and a - 2 pi, that mean one rotation: the one nearer to `reference` (3,).
+
+    A tool that points down is half a turn from the base, where the controller's vector jumps from one to the other.
+    """
+    angle = np.linalg.norm(rotvec)
+    other = rotvec * (1 - 2 * np.pi / angle) if angle > 0 else rotvec
+    return min(rotvec, other, key=lambda v: np.linalg.norm(v - reference))
+
+
 def toward(pose: np.ndarray, target: np.ndarray, metres: float, radians: float) -> np.ndarray:
     """From pose to target (6,), but no farther than so many metres and radians: straight, and on SO(3)."""
     step = difference(pose, target)
@@ -685,7 +700,7 @@ class Servo:
     - the newest state is older than `max_state_age_s`, or the connection or its framing is lost;
     - the robot is not running, its safety mode is neither normal nor reduced, or its program no longer runs;
     - an action has the wrong shape, NaN, or a jump; a target lies outside the box (unless `outside_box` is "clamp");
-    - no new targets come for `max_hold_s`.
+    - no new targets come for `max_hold_s`, since the policy is too slow or the camera gives nothing.
 
     To stop is to tell the program on the controller to end, once; nothing is sent after that.
     """
@@ -694,7 +709,7 @@ class Servo:
         self.rtde, self.settings, self.moves = rtde, settings, moves
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
-        self.held_since = time.monotonic()
+        self.held_since, self.missing = time.monotonic(), "the policy or the camera is too slow"  # why it holds
         self.lock, self.error, self.ended = threading.Lock(), None, threading.Event()
         self.lateness, self.ages, self.clamped = [], [], False
 
@@ -799,7 +814,7 @@ class Servo:
                     trouble = "the program on the controller has ended"
                 now = time.monotonic()
                 if trouble is None and now - self.held_since > settings.max_hold_s:
-                    trouble = f"no new actions for {settings.max_hold_s:g} s: the policy or the camera is too slow"
+                    trouble = f"no new actions for {settings.max_hold_s:g} s: {self.missing}"
                 if trouble is not None:
                     self.fail(trouble)
                     return
@@ -848,7 +863,18 @@ class Cell:
         """The present observation: points (N, 3) float32, base frame; state (7,) float32: TCP pose and gripper."""
         points = cloud(self.camera.read(), self.camera.intrinsics, self.settings)
         pose = self.rtde.state(self.settings.max_state_age_s).pose
+        pose[3:] = nearer(pose[3:], np.array(self.settings.rotation_near_rad))
         return points, np.append(pose, self.gripper.read()).astype(np.float32)
+
+    def wait_for_observation(self, servo: Servo) -> tuple[np.ndarray, np.ndarray]:
+        """`observe`; while the camera gives nothing the arm is held, until `servo` stops it. Then raises RobotError."""
+        while True:
+            try:
+                return self.observe()
+            except CameraError as error:
+                servo.missing = str(error)
+                servo.check()
+                time.sleep(0.02)
 
 
 @contextmanager
@@ -918,7 +944,7 @@ def execute(
             time.sleep(min(left, 0.02))
         servo.check()
         if step > len(actions) - n_obs_steps:
-            frames.append(cell.observe())
+            frames.append(cell.wait_for_observation(servo))
     return frames
 
 

@@ -359,6 +359,10 @@ def test_the_normalizer_maps_the_data_onto_minus_one_to_one_and_back():
         torch.testing.assert_close(high[moving], torch.ones_like(high[moving]))
     assert normalizer.normalize("state", state)[:, 1:].abs().max() < 1e-5  # neither stretched nor divided by zero
     torch.testing.assert_close(normalizer.normalize("state", torch.tensor([0.0, 0.9, 0.3]))[1], torch.tensor(0.2))
+    action[:, 1] = 0.4
+    normalizer.fit(points, state, action)
+    drawn = normalizer.unnormalize("action", torch.tensor([[-1.0, -1.0], [1.0, 1.0]]))
+    assert (drawn[:, 1] - 0.4).abs().max() < 1e-4  # what no demonstration moved stays
 
 
 def test_the_moving_average_follows_the_papers_decay():

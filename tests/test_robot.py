@@ -1,6 +1,7 @@
 """robot.py against an emulated arm, and both against clients and servers that we did not write."""
 
 import asyncio
+import ctypes
 import json
 import os
 import socket
@@ -209,6 +210,17 @@ def test_interpolation_is_straight_and_scipys_slerp():
 
 
 # --- Motion ----------------------------------------------------------------------------------------------------------
+
+
+def test_of_the_two_vectors_of_a_rotation_the_nearer_is_taken():
+    down = np.array([0.0, np.pi, 0.0])
+    for rotvec in np.random.default_rng(0).normal(size=(50, 3)) * 2:
+        near = robot.nearer(rotvec, down)
+        assert np.allclose(Rotation.from_rotvec(near).as_matrix(), Rotation.from_rotvec(rotvec).as_matrix())
+    before, after = (Rotation.from_euler("y", angle).as_rotvec() for angle in (np.pi - 0.01, np.pi + 0.01))
+    assert np.linalg.norm(before - after) > 6  # where scipy, as the controller, jumps
+    np.testing.assert_allclose(robot.nearer(after, down) - robot.nearer(before, down), [0, 0.02, 0], atol=1e-9)
+    assert robot.nearer(np.zeros(3), down).tolist() == [0, 0, 0]
 
 
 def test_a_chunk_moves_the_arm_to_where_its_actions_add_up(emulator, settings):
@@ -430,7 +442,9 @@ def test_missing_depth_and_an_empty_crop_are_refused_and_few_points_repeated():
 
 
 def test_the_librealsense_library_delivers_synthetic_depth():
-    rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)  # it needs libusb, too
+    libusb_package = pytest.importorskip("libusb_package")  # librealsense needs it, and not every machine has it
+    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    rs = pytest.importorskip("pyrealsense2")
     width, height, unit = 64, 48, 0.001
     device = rs.software_device()
     sensor = device.add_sensor("Depth")
@@ -584,6 +598,18 @@ def test_recording_keeps_finished_episodes_and_drops_the_others(emulator, cell, 
     assert ends(record(cell, 1)) == 2 and "exists" in capsys.readouterr().err
 
 
+def test_a_camera_lost_while_recording_ends_it_and_keeps_the_earlier_episodes(emulator, cell, monkeypatch, capsys):
+    Typing(monkeypatch, (0.2, "s"), (0.4, "e"), (0.1, "s"))
+    read = robot.RecordedCamera.read
+    lost = lambda self: np.zeros((120, 160), np.float32) if Path("demos").exists() else read(self)  # noqa: E731
+    monkeypatch.setattr(robot.RecordedCamera, "read", lost)
+    assert ends(record(cell, 5)) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "depth is empty" in error
+    assert len(data.load_demonstrations("demos/stack-cube.npz")) == 1
+    assert "end_freedrive_mode" in programs(emulator, 2)[-1]
+
+
 def test_ctrl_c_while_recording_keeps_the_earlier_episodes(emulator, cell, monkeypatch, capsys):
     Typing(monkeypatch, (0.2, "s"), (0.4, "e"), (0.1, "s"))
     observe = robot.Cell.observe
@@ -661,6 +687,24 @@ def test_a_stop_while_running_ends_the_command_with_the_reason(emulator, cell, c
     assert ends(argv) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "protective stop" in error
+    assert_stop_is_last(emulator)
+
+
+@pytest.mark.parametrize("lost_for", [0.4, 60])
+def test_a_camera_that_gives_nothing_holds_the_arm_and_then_stops_it(emulator, cell, monkeypatch, capsys, lost_for):
+    robot_policy("policy.pt")
+    read, began = robot.RecordedCamera.read, []
+
+    def failing(self):
+        began.append(time.monotonic())
+        lost = 1.0 < time.monotonic() - began[0] < 1.0 + lost_for
+        return np.zeros((120, 160), np.float32) if lost else read(self)
+
+    monkeypatch.setattr(robot.RecordedCamera, "read", failing)
+    argv = ["run", *cell, "--checkpoint", "policy.pt", "--data", "demos.npz", "--seconds", "4"]
+    assert ends(argv) == (2 if lost_for > 1 else 0)
+    error = capsys.readouterr().err
+    assert lost_for < 1 or (error.count("\n") == 1 and "no new actions for 2 s: the camera's depth is empty" in error)
     assert_stop_is_last(emulator)
 
 
