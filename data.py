@@ -46,6 +46,7 @@ warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")  # t
 
 EPISODE_STEPS = 200
 EPISODE_SEEDS = 100_000  # episodes one run seed may draw
+TASK_SEEDS = 2_000  # of them, those of one task's demonstrations
 RUN_SEEDS = 1_000  # run seeds 0 ... 999: demonstrations use episode seeds below 10**8, evaluation those from 10**8
 
 
@@ -133,16 +134,24 @@ def check_task(task: str) -> str:
     return choose(task, INSTRUCTIONS, "task")
 
 
-def demonstration_seed(seed: int, attempt: int) -> int:
-    """Episode seed of one attempt at a demonstration; below 10**8, so never one of `evaluation_seed`."""
-    if not 0 <= seed < RUN_SEEDS or not 0 <= attempt < EPISODE_SEEDS:
-        raise InputError(f"seed {seed} is out of range: use a seed from 0 to {RUN_SEEDS - 1}")
-    return seed * EPISODE_SEEDS + attempt
+def demonstration_seed(task: str, seed: int, attempt: int) -> int:
+    """Episode seed of one attempt at a demonstration; below 10**8, so never one of `evaluation_seed`.
+
+    It differs from task to task: some draw their goals alike, and would show the same ten.
+    """
+    return episode_seed(seed, TASK_SEEDS * list(INSTRUCTIONS).index(task) + attempt)
 
 
 def evaluation_seed(seed: int, episode: int) -> int:
     """Episode seed of one evaluation rollout; at least 10**8, so its goals were in no demonstration."""
-    return RUN_SEEDS * EPISODE_SEEDS + demonstration_seed(seed, episode)
+    return RUN_SEEDS * EPISODE_SEEDS + episode_seed(seed, episode)
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """Below RUN_SEEDS * EPISODE_SEEDS = 10**8."""
+    if not 0 <= seed < RUN_SEEDS or not 0 <= episode < EPISODE_SEEDS:
+        raise InputError(f"seed {seed} is out of range: use a seed from 0 to {RUN_SEEDS - 1}")
+    return seed * EPISODE_SEEDS + episode
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -509,6 +518,13 @@ class Demonstrations:
                 f"{len(self.action)} of action, episode_ends up to {ends[-1]}"
             )
         successes = self.meta.get("success_frames")
+        positions = self.meta.get("positions_in_state", 0)
+        if type(positions) is not int or not 0 <= 3 * positions <= self.state.shape[1]:
+            raise InputError(
+                f"{name}: positions_in_state is {positions!r}, with {self.state.shape[1]} numbers in a state"
+            )
+        if positions and self.action.shape[1] < 3:
+            raise InputError(f"{name}: with positions_in_state an action must begin with a displacement")
         listed = isinstance(successes, list) and all(type(frame) is int and frame >= 0 for frame in successes)
         if successes is not None and not (listed and len(successes) >= len(ends)):
             raise InputError(f"{name}: success_frames must be a list with one whole number for each episode")
@@ -581,6 +597,7 @@ RECIPE = {
     "workspace": [list(corner) for corner in WORKSPACE],
     "num_points": NUM_POINTS,
     "sampling": "farthest points",
+    "positions_in_state": 3,  # of hand and fingers: they move with the scene, and actions begin with a displacement
 }
 
 
@@ -621,7 +638,7 @@ def collect_task(task: str, path: Path, episodes: int, seed: int) -> Path | None
     while len(seeds) < episodes:
         if attempt >= ATTEMPTS_PER_EPISODE * episodes:
             raise InputError(f"{task}: the expert succeeded in {len(seeds)} of {attempt} episodes; try another --seed")
-        episode_seed = demonstration_seed(seed, attempt)
+        episode_seed = demonstration_seed(task, seed, attempt)
         episode = record_episode(env, episode_seed, worker.stop.is_set)
         if worker.stop.is_set():
             return None
@@ -660,7 +677,7 @@ def collect(
         raise InputError(f"--episodes is {episodes}: use at least 1")
     if workers is not None and workers < 1:
         raise InputError(f"--workers is {workers}: use at least 1")
-    demonstration_seed(seed, 0)
+    episode_seed(seed, 0)  # refuses a seed out of range
     paths = {check_task(task): Path(folder) / f"{task}.npz" for task in tasks}
     missing = []
     for task, path in paths.items():
@@ -701,6 +718,23 @@ def collect(
 # ---------------------------------------------------------------------------------------------------------------------
 # Windows
 
+SHIFT, TURN, STRETCH = (0.1, 0.1, 0.05), np.radians(10), 0.1  # metres along each axis, radians, share: at most
+
+
+def random_maps(n: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Draw n affine maps of space, x -> x A^T + b: a shear and stretch, a turn about the vertical, a shift.
+
+    Returns A (n, 3, 3) and b (n, 1, 3), float32, metres; the middle of the workspace is what is turned about.
+    """
+    symmetric = lambda *shape: 2 * torch.rand(shape, generator=generator, device=generator.device).cpu() - 1  # noqa: E731
+    angle, zero, one = TURN * symmetric(n), torch.zeros(n), torch.ones(n)
+    cos, sin = angle.cos(), angle.sin()
+    turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1).view(n, 3, 3)
+    a = turn @ (torch.eye(3) + STRETCH * symmetric(n, 3, 3))
+    middle = torch.tensor(WORKSPACE).mean(dim=0, keepdim=True)  # (1, 3)
+    b = middle - middle @ a.mT + torch.tensor(SHIFT) * symmetric(n, 3)[:, None]
+    return a, b
+
 
 class WindowSampler:
     """Windows of `horizon` actions that begin with `n_obs_steps` observations, drawn from one task's demonstrations.
@@ -709,7 +743,8 @@ class WindowSampler:
     frames repeated: 193 windows in an episode of 200 frames. The clouds are held once, as float16, on `device`.
     Arguments: `num_points`, how many of each cloud's points are used (the first, a farthest point sample themselves);
     `demo_stride`, every how many frames `demonstration` takes one; `after_success`, how many frames after its episode's
-    first success a window may begin, where the demonstrations' `meta` tells that frame (None: any number).
+    first success a window may begin, where the demonstrations' `meta` tells that frame (None: any number); `augment`,
+    whether `batch` puts each scene elsewhere by one of `random_maps`, where `meta` tells the positions in a state.
     """
 
     def __init__(
@@ -722,6 +757,7 @@ class WindowSampler:
         demo_stride: int = 1,
         device: str | torch.device = "cpu",
         after_success: int | None = None,
+        augment: bool = False,
     ) -> None:
         if not 1 <= n_action_steps <= horizon - n_obs_steps + 1:
             raise InputError(
@@ -734,6 +770,7 @@ class WindowSampler:
             )
         self.task, self.instruction = demonstrations.task, demonstrations.instruction
         self.n_obs_steps, self.demo_stride = n_obs_steps, demo_stride
+        self.positions = demonstrations.meta.get("positions_in_state", 0) if augment else 0
         self.points = torch.tensor(demonstrations.points[:, :num_points], dtype=torch.float16, device=device)
         self.state = torch.tensor(demonstrations.state, dtype=torch.float32, device=device)  # (F, S)
         self.action = torch.tensor(demonstrations.action, dtype=torch.float32, device=device)  # (F, A)
@@ -789,8 +826,25 @@ class WindowSampler:
 
         Returns what `sample` does, and demo_points (1, T, N, 3), demo_state (1, T, S), demo_action (1, T, A).
         """
-        demo = {f"demo_{name}": x[None] for name, x in self.demonstration(generator).items()}
-        return self.sample(n, generator) | demo
+        demo = {name: x[None] for name, x in self.demonstration(generator).items()}
+        windows = self.sample(n, generator)
+        if self.positions:
+            demo, windows = self.elsewhere(demo, generator), self.elsewhere(windows, generator)
+        return windows | {f"demo_{name}": x for name, x in demo.items()}
+
+    def elsewhere(self, scenes: dict[str, torch.Tensor], generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """Put each of n scenes elsewhere: points (n, T, N, 3), state (n, T, S) and action (n, T', A)."""
+        points, state, action = (scenes[name] for name in ("points", "state", "action"))
+        a, b = (x.to(points.device) for x in random_maps(len(points), generator))
+        place = lambda x: (x.flatten(1, -2) @ a.mT + b).view_as(x)  # noqa: E731
+        at = 3 * self.positions
+        positions = place(state[..., :at].unflatten(-1, (-1, 3))).flatten(-2)
+        moved = (action[..., :3] @ a.mT).clamp(-1, 1)
+        return {
+            "points": place(points),
+            "state": torch.cat([positions, state[..., at:]], dim=-1),
+            "action": torch.cat([moved, action[..., 3:]], dim=-1),
+        }
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -145,11 +145,11 @@ def text_features(instructions: Sequence[str], weights: str | None, identity: st
 
 
 def window_sampler(
-    policy: DAMIPolicy, demonstrations: Demonstrations, after_success: int | None = None
+    policy: DAMIPolicy, demonstrations: Demonstrations, after_success: int | None = None, augment: bool = False
 ) -> WindowSampler:
     """The sampler of one task's demonstrations with this policy's horizon, points and stride, on its device.
 
-    `after_success`: how many frames after an episode's first success a window may begin; None: any number.
+    `after_success` and `augment` are for training, as in `WindowSampler`.
 
     Raises InputError where policy and demonstrations disagree.
     """
@@ -169,6 +169,7 @@ def window_sampler(
         config.demo_stride,
         device,
         after_success,
+        augment,
     )
     longest = max(math.ceil((e.stop - e.start) / config.demo_stride) for e in sampler.episodes)
     if config.demo_encoder != "none" and longest > config.demo_positions:
@@ -373,14 +374,12 @@ def success_table(columns: dict[str, Successes], suite: str | None = None) -> st
 
 def draw_success(columns: dict[str, Successes], path: Path, title: str, suite: str | None = None) -> None:
     """A bar chart of success rates with their Wilson intervals, a group a task, the paper's beside them."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    from matplotlib.figure import Figure
 
     tasks = list(next(iter(columns.values())))
     groups = len(columns) + 1
-    figure, axes = plt.subplots(figsize=(max(4.5, 2 + 0.9 * len(tasks)), 3.6), layout="constrained")
+    figure = Figure(figsize=(max(4.5, 2 + 0.9 * len(tasks)), 3.6), layout="constrained")
+    axes = figure.subplots()
     x, width = np.arange(len(tasks)), 0.8 / groups
     for i, (label, results) in enumerate(columns.items()):
         rates = np.array([np.mean(results[task]) for task in tasks])
@@ -397,7 +396,6 @@ def draw_success(columns: dict[str, Successes], path: Path, title: str, suite: s
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(frameon=False, ncols=groups, loc="outside upper center", fontsize=8)
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
-    plt.close(figure)
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
@@ -458,11 +456,8 @@ def write_gif(policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, seed: in
 
     Returns whether the episode succeeded.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
     from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.figure import Figure
 
     env = MetaWorldPointCloudEnv(sampler.task, policy.config.num_points, render_mode="rgb_array")
     frames = []
@@ -475,7 +470,7 @@ def write_gif(policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, seed: in
     on_chunk(0, env.observe())  # how it ended
     clouds = np.concatenate([cloud for _, cloud in frames])
     low, high = clouds.min(0), clouds.max(0)
-    figure = plt.figure(figsize=(6, 3), layout="constrained")
+    figure = Figure(figsize=(6, 3), layout="constrained")
     left = figure.add_subplot(1, 2, 1)
     right = figure.add_subplot(1, 2, 2, projection="3d")
 
@@ -496,7 +491,6 @@ def write_gif(policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, seed: in
 
     animation = FuncAnimation(figure, draw, frames=[*range(len(frames)), len(frames) - 1, len(frames) - 1])
     write_atomically(path, lambda temporary: animation.save(temporary, writer=PillowWriter(fps=8), dpi=70))
-    plt.close(figure)
     return success
 
 

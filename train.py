@@ -67,6 +67,7 @@ SETTINGS = {
         "support": 20,  # windows a task for the inner step
         "query": 88,  # windows a task for the outer loss
         "after_success": None,  # windows may begin anywhere in an episode
+        "augment": False,  # scenes stay where they are
         "inner_lr": 1e-4,
         "multi_task_share": 0.0,  # of the steps, the first ones, without the inner step; MAML after them
         "vectorize": 1,  # tasks at once; 258 M adapted parameters a task are many
@@ -82,6 +83,7 @@ SETTINGS = {
         "support": 4,
         "query": 12,
         "after_success": 20,  # or at most so many frames after its first success: three in five frames are later
+        "augment": True,  # each window's scene, and the demonstration's, is put elsewhere at random
         "inner_lr": 1e-4,
         "multi_task_share": 0.7,  # a quarter of the time a step, nearly the same gradient while the policy is rough
         "vectorize": 10,
@@ -97,6 +99,7 @@ SETTINGS = {
         "support": 4,
         "query": 8,
         "after_success": 20,
+        "augment": False,
         "inner_lr": 1e-3,
         "multi_task_share": 0.0,
         "vectorize": 10,
@@ -202,16 +205,14 @@ def rewind_metrics(folder: Path, step: int) -> None:
 
 def draw_curves(folder: Path) -> None:
     """Draws curves.png from metrics.jsonl: the query loss, its running mean, and success where it was measured."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    from matplotlib.figure import Figure
 
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     steps = np.array([line["step"] for line in lines if "loss" in line])
     losses = np.array([line["loss"] for line in lines if "loss" in line])
     evaluated = [(line["step"], line["success"]) for line in lines if "success" in line]
-    figure, axes = plt.subplots(figsize=(7, 3.6), layout="constrained")
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    axes = figure.subplots()
     axes.plot(steps, losses, color="C0", alpha=0.3, linewidth=0.8, label="query loss")
     width = max(1, len(losses) // 50)
     mean = np.convolve(losses, np.ones(width) / width, mode="valid")
@@ -227,7 +228,6 @@ def draw_curves(folder: Path) -> None:
         handles, labels = [*handles, line], [*labels, "success (right)"]
     axes.legend(handles, labels, frameon=False)
     write_atomically(folder / "curves.png", lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
-    plt.close(figure)
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
@@ -248,6 +248,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     method.add_argument("--maml", choices=("second", "first", "off"), default="second", help="order (default: second)")
     method.add_argument("--demo-encoder", choices=("vmt", "mlp", "none"), help="encoder of the demonstration")
     method.add_argument("--tcfm", choices=("down", "mid", "up", "none"), help="the U-Net level that reads it")
+    method.add_argument(
+        "--augment", action=argparse.BooleanOptionalAction, help="shift, turn and stretch each scene at random"
+    )
     for name, kind, text in [
         ("steps", int, "outer steps"),
         ("support", int, "windows a task for the inner step"),
@@ -348,8 +351,8 @@ def main(argv: list[str] | None = None) -> None:
             module.normalizer.fit(**{name: torch.from_numpy(x) for name, x in every.items()})
     features, identity = text_features([d.instruction for d in demonstrations], args.clip_weights, identity)
     text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
-    after = settings["after_success"]
-    samplers = {task: window_sampler(policy, d, after) for task, d in zip(tasks, demonstrations)}
+    drawn = settings["after_success"], settings["augment"]
+    samplers = {task: window_sampler(policy, d, *drawn) for task, d in zip(tasks, demonstrations)}
     info = {"suite": suite, "preset": preset, "text_weights": identity, "arguments": arguments}
     if leader and start == 0:
         (folder / "metrics.jsonl").unlink(missing_ok=True)

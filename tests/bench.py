@@ -74,7 +74,7 @@ def matrix_rate(device: torch.device) -> float:
 def frame_times(task: str, frames: int = 100) -> dict[str, float]:
     """Milliseconds a frame of an expert episode, on one core: physics (and the expert), rays, sampling."""
     env = MetaWorldPointCloudEnv(task)
-    env.begin(demonstration_seed(0, 0))
+    env.begin(demonstration_seed(task, 0, 0))
     times = {"physics": [], "rays": [], "sampling": []}
     for _ in range(frames):
         t0 = time.perf_counter()
@@ -93,7 +93,7 @@ def demonstration(task: str) -> Demonstrations:
     """One recorded episode of the expert."""
     env = MetaWorldPointCloudEnv(task)
     seed = 0
-    while (episode := record_episode(env, demonstration_seed(0, seed))) is None:
+    while (episode := record_episode(env, demonstration_seed(task, 0, seed))) is None:
         seed += 1
     arrays = {name: np.stack(values) for name, values in episode[0].items()}
     return Demonstrations(task, "bench", **arrays, episode_ends=np.array([len(arrays["action"])]), meta={})

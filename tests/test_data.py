@@ -78,11 +78,13 @@ def test_an_unknown_name_suggests_the_nearest(call):
 
 
 def test_demonstrations_and_evaluation_never_share_a_seed():
-    assert data.demonstration_seed(999, 99_999) < 10**8 <= data.evaluation_seed(0, 0)
+    tasks = list(data.INSTRUCTIONS)
+    seeds = {data.demonstration_seed(task, seed, n) for task in tasks for seed in (0, 999) for n in range(2000)}
+    assert len(seeds) == 50 * 2 * 2000 and max(seeds) < 10**8 <= data.evaluation_seed(0, 0)
     assert len({data.evaluation_seed(seed, episode) for seed in (0, 1, 2) for episode in range(50)}) == 150
     for seed in (-1, 1000):
         with pytest.raises(InputError, match="0 to 999"):
-            data.demonstration_seed(seed, 0)
+            data.demonstration_seed("reach", seed, 0)
 
 
 # --- Camera ----------------------------------------------------------------------------------------------------------
@@ -498,6 +500,51 @@ def test_windows_begin_up_to_so_many_frames_after_the_first_success():
     for wrong in ([10], [10, "28"], [10, -1], 10):
         with pytest.raises(InputError, match="success_frames must be"):
             replace(recorded, meta={"success_frames": wrong}).check("reach.npz")
+    for wrong in (4, -1, "3", True):
+        with pytest.raises(InputError, match="positions_in_state is"):
+            replace(recorded, meta={"positions_in_state": wrong}).check("reach.npz")
+
+
+def test_scenes_are_put_elsewhere_and_stay_consistent():
+    recorded = recording((40, 30))
+    rng = np.random.default_rng(0)
+    recorded.action[:] = rng.uniform(-0.5, 0.5, recorded.action.shape)
+    hand = np.cumsum(recorded.action[:, :3], axis=0) / 100 - recorded.action[:, :3] / 100  # action = 100 x displacement
+    recorded.state[:, :6] = np.tile(hand, 2)
+    recorded.points[:] = hand[:, None] + rng.uniform(-0.05, 0.05, (1, *recorded.points.shape[1:]))  # carried along
+    recorded.meta["positions_in_state"] = 2
+    plain, moved = (WindowSampler(recorded, num_points=16, augment=on) for on in (False, True))
+    before, after = (s.batch(12, torch.Generator().manual_seed(0)) for s in (plain, moved))
+    assert {name: x.shape for name, x in before.items()} == {name: x.shape for name, x in after.items()}
+    for prefix in ("", "demo_"):
+        points, state, action = (after[prefix + name] for name in ("points", "state", "action"))
+        for part in (slice(0, 3), slice(3, 6)):
+            torch.testing.assert_close(
+                100 * state[:, :-1, part].diff(dim=1), action[:, : state.shape[1] - 2, :3], atol=1e-3, rtol=0
+            )
+        offsets = points - state[:, :, None, :3]  # the same in every frame of a scene, up to float16
+        torch.testing.assert_close(offsets, offsets[:, :1].expand_as(offsets), atol=5e-3, rtol=0)
+        assert torch.equal(state[..., 6:], before[prefix + "state"][..., 6:])
+        assert torch.equal(action[..., 3:], before[prefix + "action"][..., 3:])
+    shifts = (after["state"] - before["state"])[:, 0, :3]
+    assert len(torch.unique(shifts, dim=0)) == 12 and 0.02 < shifts.abs().max() < 0.3  # each window its own
+    recorded.meta.clear()
+    untold = WindowSampler(recorded, num_points=16, augment=True).batch(12, torch.Generator().manual_seed(0))
+    assert all(torch.equal(untold[name], x) for name, x in before.items())
+
+
+def test_the_maps_of_scenes_keep_to_their_limits(monkeypatch):
+    a, b = data.random_maps(1000, torch.Generator().manual_seed(0))
+    middle = torch.tensor(data.WORKSPACE).mean(dim=0)
+    shift = (middle[None] @ a.mT + b)[:, 0] - middle
+    assert (shift.abs() <= torch.tensor(data.SHIFT) + 1e-6).all() and (shift.abs().amax(0) > 0.04).all()
+    assert (torch.linalg.matrix_norm(a - torch.eye(3), ord=2) < 3 * data.STRETCH + 2 * data.TURN).all()
+    monkeypatch.setattr(data, "STRETCH", 0.0)
+    a, _ = data.random_maps(1000, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(a @ a.mT, torch.eye(3).expand_as(a))  # turns
+    assert (a[:, 2] == torch.tensor([0.0, 0.0, 1.0])).all()
+    angles = torch.atan2(a[:, 1, 0], a[:, 0, 0])
+    assert angles.abs().max() <= data.TURN + 1e-6 and angles.max() > 0.9 * data.TURN and angles.min() < -0.9 * data.TURN
 
 
 def test_sampling_is_float32_repeatable_and_without_repetition():
