@@ -79,18 +79,18 @@ SETTINGS = {
         "demonstrations": 10,
     },
     "small": {
-        "steps": 6_000,
+        "steps": 10_000,
         "support": 4,
         "query": 12,
         "after_success": 20,  # or at most so many frames after its first success: three in five frames are later
         "augment": True,  # each window's scene, and the demonstration's, is put elsewhere at random
         "inner_lr": 1e-4,
-        "multi_task_share": 0.7,  # a quarter of the time a step, nearly the same gradient while the policy is rough
+        "multi_task_share": 0.8,  # a quarter of the time a step, nearly the same gradient while the policy is rough
         "vectorize": 10,
         "lr": 1e-3,
         "warmup": 100,
-        "checkpoint_every": 600,
-        "evaluate_every": 6_000,
+        "checkpoint_every": 1_000,
+        "evaluate_every": 10_000,
         "episodes": 20,
         "demonstrations": 10,
     },

@@ -441,6 +441,21 @@ def test_missing_depth_and_an_empty_crop_are_refused_and_few_points_repeated():
     assert points.shape == (100, 3) and len(np.unique(points, axis=0)) == 2
 
 
+def test_a_large_depth_image_is_thinned_out_before_it_is_sampled(monkeypatch):
+    sizes, sample = [], robot.farthest_point_sample
+    monkeypatch.setattr(
+        robot, "farthest_point_sample", lambda points, n: sizes.append(len(points)) or sample(points, n)
+    )
+    rows, columns = np.mgrid[:480, :640]
+    depth = (0.7 + 0.0002 * rows + 0.0001 * columns).astype(np.float32)
+    settings = Settings(**BOXES | {"camera_to_base": CAMERA_TO_BASE}, num_points=256)
+    points = robot.cloud(depth, robot.Intrinsics(600.0, 600.0, 320.0, 240.0), settings)
+    everything = robot.cloud(depth[::8, ::8], robot.Intrinsics(75.0, 75.0, 40.0, 30.0), settings)
+    assert sizes[0] <= robot.SAMPLED_FROM < depth.size
+    np.testing.assert_allclose(points.min(0), everything.min(0), atol=0.02)
+    np.testing.assert_allclose(points.max(0), everything.max(0), atol=0.02)
+
+
 def test_the_librealsense_library_delivers_synthetic_depth():
     libusb_package = pytest.importorskip("libusb_package")  # librealsense needs it, and not every machine has it
     ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
