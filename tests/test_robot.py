@@ -695,13 +695,35 @@ def test_keys_that_arrive_together_are_all_read(monkeypatch):
         assert [keys.pressed() for _ in range(3)] == ["s", "e", ""]
 
 
-def test_a_stop_while_running_ends_the_command_with_the_reason(emulator, cell, capsys):
+@pytest.mark.parametrize(
+    "fault, value, message",
+    [("safety_mode", 3, "protective stop"), ("gripper_silent", 1000, "gripper at 127.0.0.1"), ("drop", True, "closed")],
+)
+def test_trouble_while_running_stops_the_arm_and_ends_the_command_with_the_reason(
+    emulator, cell, capsys, fault, value, message
+):
     robot_policy("policy.pt")
-    threading.Timer(1.5, lambda: setattr(emulator.faults, "safety_mode", 3)).start()
+    threading.Timer(1.5, lambda: setattr(emulator.faults, fault, value)).start()
     argv = ["run", *cell, "--checkpoint", "policy.pt", "--data", "demos.npz", "--seconds", "20"]
     assert ends(argv) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "protective stop" in error
+    assert error.count("\n") == 1 and message in error
+    if fault != "drop":  # there the watchdog stops it
+        assert_stop_is_last(emulator)
+
+
+def test_ctrl_c_while_running_stops_the_arm(emulator, cell, monkeypatch):
+    robot_policy("policy.pt")
+    execute, chunks = robot.execute, []
+
+    def interrupted(*args):
+        chunks.append(None)
+        if len(chunks) == 2:
+            raise KeyboardInterrupt
+        return execute(*args)
+
+    monkeypatch.setattr(robot, "execute", interrupted)
+    assert ends(["run", *cell, "--checkpoint", "policy.pt", "--data", "demos.npz"]) == 130
     assert_stop_is_last(emulator)
 
 
