@@ -383,11 +383,11 @@ def table_entry(value: int) -> int:
 CRC_TABLE = [table_entry(value) for value in range(256)]
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Emulate a UR10e and its gripper on loopback.")
     parser.add_argument("--hand", type=float, default=4.0, help="seconds a round of the hand that guides a free arm")
     parser.add_argument("--scene", metavar="FILE", default="scene.npz", help="recorded camera to write (scene.npz)")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     write_scene(args.scene)
     print(f"wrote {args.scene}, a recorded camera")
     with Emulator(30004, 30002, 29999, 54321, args.hand) as emulator:
