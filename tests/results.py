@@ -1,7 +1,7 @@
-"""RESULTS.json, and what the README shows of it: tables and a chart.
+"""RESULTS.json, and what the README shows of it: tables, learning curve and chart.
 
     python -m tests.results runs/seeds    # takes this report of evaluate.py into RESULTS.json
-    python -m tests.results               # writes the README's tables, draws the chart
+    python -m tests.results               # writes the README's tables, draws the pictures
 
 RESULTS.json keeps for each report every episode (1: success, 0: not), the command that measured it, hardware, seed and
 date; and for each training run that a report names its settings, command and time.
@@ -20,6 +20,19 @@ from evaluate import Successes, format_success, mean_interval, mean_success, pap
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "RESULTS.json"
 BASE, NOVEL = suite_tasks("ml10")
+SEEDS = ["seeds", "seed2"]  # reports of the policy as it ships, one to three runs in each
+ABLATIONS = {  # run -> what is different in it
+    "ml10-small-seed0": "DAMI",
+    "multi-task": "no MAML at all (`--maml off`)",
+    "short-dami": "DAMI",
+    "short-multi-task": "no MAML at all (`--maml off`)",
+    "short-first-order": "first order instead of second (`--maml first`)",
+    "short-mlp": "an MLP instead of VMT (`--demo-encoder mlp`)",
+    "short-mid": "TCFM in the middle of the U-Net (`--tcfm mid`)",
+    "short-up": "TCFM in up-sampling (`--tcfm up`)",
+    "short-dp3-maml": "DP3 + MAML (`--demo-encoder none --tcfm none`)",
+    "short-dp3": "multi-task DP3 (the same with `--maml off`)",
+}
 
 
 def take(results: dict, folder: Path) -> None:
@@ -29,17 +42,18 @@ def take(results: dict, folder: Path) -> None:
         for label, successes in report.get(kind, {}).items():
             report[kind][label] = {task: "".join(str(int(s)) for s in episodes) for task, episodes in successes.items()}
     results["evaluations"][folder.name] = report
-    for run in {label.split("/")[0] for label in report["successes"]}:
+    for run in {label.split("/")[0] for label in report["successes"]} - {"assets"}:
         path = folder.parent / run
         lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
         minutes = [line["seconds"] for line in lines if "loss" in line][-1] / 60
         results["trainings"][run] = {"minutes": round(minutes, 1), **json.loads((path / "config.json").read_text())}
 
 
-def successes(results: dict, report: str, kind: str = "successes") -> dict[str, Successes]:
-    """Label -> task -> episodes of one report."""
+def successes(results: dict, reports: list[str], kind: str = "successes") -> dict[str, Successes]:
+    """Label -> task -> episodes of reports."""
     return {
         label: {task: [c == "1" for c in episodes] for task, episodes in tasks.items()}
+        for report in reports
         for label, tasks in results["evaluations"][report].get(kind, {}).items()
     }
 
@@ -48,25 +62,46 @@ def only(results: Successes, tasks: list[str]) -> Successes:
     return {task: results[task] for task in tasks}
 
 
-def seeds_table(results: dict, tasks: list[str], reports: dict[str, str]) -> str:
-    """A row a task: the seeds' episodes together, a column for each report; the means over seeds in the last row."""
-    lines = [f"| task | {' | '.join(reports)} | paper, DP3 | paper, DAMI |", "|---" * (len(reports) + 3) + "|"]
-    runs = {title: list(successes(results, report).values()) for title, report in reports.items()}
+def pooled(results: Successes, tasks: list[str]) -> str:
+    """The episodes of several tasks together, with Wilson's interval."""
+    episodes = [success for task in tasks for success in results[task]]
+    return format_success(sum(episodes), len(episodes))
+
+
+def seeds_table(results: dict, tasks: list[str], columns: dict[str, list[str]]) -> str:
+    """A row a task: the seeds' episodes together, a column for some reports; the means over seeds in the last row."""
+    lines = [f"| task | {' | '.join(columns)} | paper, DP3 | paper, DAMI |", "|---" * (len(columns) + 3) + "|"]
+    runs = {title: list(successes(results, reports).values()) for title, reports in columns.items()}
     paper = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
     dp3 = {task: (paper["base"] | paper["novel"])[task]["DP3"] for task in tasks}
     for task in tasks:
-        pooled = [[s for run in columns for s in run[task]] for columns in runs.values()]
-        cells = [format_success(sum(episodes), len(episodes)) for episodes in pooled]
+        cells = [pooled({task: [s for run in seeds for s in run[task]]}, [task]) for seeds in runs.values()]
         lines.append(f"| {task} | {' | '.join(cells)} | {dp3[task]:.1f} | {paper_success('ml10', task):.1f} |")
-    means = [mean_interval([mean_success(only(run, tasks)) for run in columns]) for columns in runs.values()]
+    means = [mean_interval([mean_success(only(run, tasks)) for run in seeds]) for seeds in runs.values()]
     ours = np.mean([paper_success("ml10", task) for task in tasks])
     lines.append(f"| **mean** | {' | '.join(means)} | {np.mean(list(dp3.values())):.1f} | {ours:.1f} |")
     return "\n".join(lines)
 
 
+def ablation_table(results: dict) -> str:
+    """A row a run of seed 0: what is different in it, and its means over the base and over the novel tasks."""
+    lines = ["| outer steps | variant | base | novel |", "|---|---|---|---|"]
+    reports = [name for name, report in results["evaluations"].items() if report["facts"]["adaptation steps"] == 200]
+    measured = {label.split("/")[0]: run for label, run in successes(results, reports).items()}
+    for run, title in ABLATIONS.items():
+        if run in measured and {*BASE, *NOVEL} <= {*measured[run]}:
+            steps = results["trainings"][run]["arguments"]["steps"]
+            cells = [pooled(measured[run], tasks) for tasks in (BASE, NOVEL)]
+            lines.append(f"| {steps} | {title} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 TABLES = {
-    "base": lambda results: seeds_table(results, BASE, {"small": "seeds"}),
-    "novel": lambda results: seeds_table(results, NOVEL, {"small, 200 steps": "seeds"}),
+    "base": lambda results: seeds_table(results, BASE, {"small, 3 seeds": SEEDS, "the one in `assets/`": ["shipped"]}),
+    "novel": lambda results: seeds_table(
+        results, NOVEL, {"small, 3 seeds": SEEDS, "the one in `assets/`": ["shipped"]}
+    ),
+    "ablations": ablation_table,
 }
 
 
@@ -89,7 +124,7 @@ def draw(results: dict) -> None:
 
     figure, axes = plt.subplots(figsize=(9, 3.4), layout="constrained")
     tasks = BASE + NOVEL
-    runs = list(successes(results, "seeds").values())
+    runs = list(successes(results, SEEDS).values())
     rates = np.array([[100 * np.mean(run[task]) for task in tasks] for run in runs])  # (seeds, tasks)
     x = np.arange(len(tasks)) + 0.5 * (np.arange(len(tasks)) >= len(BASE))
     axes.bar(x - 0.2, rates.mean(0), 0.4, color="C0", label=f"small, mean of {len(runs)} seeds")

@@ -14,7 +14,7 @@ README = (ROOT / "README.md").read_text()
 
 def test_the_tables_of_the_readme_are_those_of_the_results():
     results = json.loads(RESULTS.read_text())
-    assert README.count("<!-- results: ") == 2 and fill(README, results) == README
+    assert README.count("<!-- results: ") == 3 and fill(README, results) == README
 
 
 def test_a_cell_of_the_base_table_can_be_recomputed_from_the_episodes():
@@ -32,7 +32,9 @@ def test_every_result_says_how_it_was_measured():
     for report in results["evaluations"].values():
         assert {"command", "hardware", "seed", "date", "text weights"} <= set(report["facts"])
         for label, run in report["successes"].items():
-            assert label.split("/")[0] in results["trainings"] and all(set(e) <= {"0", "1"} for e in run.values())
+            assert label.split("/")[0] in {*results["trainings"], "assets"} and all(
+                set(e) <= {"0", "1"} for e in run.values()
+            )
             assert len({len(episodes) for episodes in run.values()}) == 1
     for training in results["trainings"].values():
         assert {"command", "hardware", "arguments", "minutes"} <= set(training) and np.isfinite(training["minutes"])
