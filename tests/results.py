@@ -1,7 +1,7 @@
-"""RESULTS.json, and what the README shows of it: tables, learning curve and chart.
+"""RESULTS.json, and what the README shows of it: tables and a chart.
 
     python -m tests.results runs/seeds    # takes this report of evaluate.py into RESULTS.json
-    python -m tests.results               # writes the README's tables, draws the pictures
+    python -m tests.results               # writes the README's tables, draws the chart
 
 RESULTS.json keeps for each report every episode (1: success, 0: not), the command that measured it, hardware, seed and
 date; and for each training run that a report names its settings, command and time.
@@ -25,11 +25,9 @@ ABLATIONS = {  # run -> what is different in it
     "ml10-small-seed0": "DAMI",
     "multi-task": "no MAML at all (`--maml off`)",
     "short-dami": "DAMI",
-    "short-multi-task": "no MAML at all (`--maml off`)",
     "short-first-order": "first order instead of second (`--maml first`)",
     "short-mlp": "an MLP instead of VMT (`--demo-encoder mlp`)",
     "short-mid": "TCFM in the middle of the U-Net (`--tcfm mid`)",
-    "short-up": "TCFM in up-sampling (`--tcfm up`)",
     "short-dp3-maml": "DP3 + MAML (`--demo-encoder none --tcfm none`)",
     "short-dp3": "multi-task DP3 (the same with `--maml off`)",
 }
