@@ -28,6 +28,13 @@ def test_a_cell_of_the_base_table_can_be_recomputed_from_the_episodes():
     assert [float(x) for x in row.groups()] == pytest.approx([100 * x for x in expected], abs=0.051)
 
 
+def test_a_cell_of_the_ablation_table_can_be_recomputed_from_the_episodes():
+    (run,) = json.loads(RESULTS.read_text())["evaluations"]["eval-short-dp3"]["successes"].values()
+    row = re.search(r"^\| 2000 \| multi-task DP3 .* \| ([\d.]+) \[.* \| ([\d.]+) \[", README, re.M)
+    expected = ["".join(run[task] for task in tasks) for tasks in (BASE, NOVEL)]
+    assert [float(x) for x in row.groups()] == pytest.approx([100 * e.count("1") / len(e) for e in expected], abs=0.051)
+
+
 def test_every_result_says_how_it_was_measured():
     results = json.loads(RESULTS.read_text())
     for report in results["evaluations"].values():
