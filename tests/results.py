@@ -1,7 +1,7 @@
-"""RESULTS.json, and what the README shows of it: tables and a chart.
+"""RESULTS.json, and what the README shows of it: tables, a learning curve, a chart.
 
     python -m tests.results runs/seeds    # takes this report of evaluate.py into RESULTS.json
-    python -m tests.results               # writes the README's tables, draws the chart
+    python -m tests.results               # writes the README's tables, draws the pictures
 
 RESULTS.json keeps for each report every episode (1: success, 0: not), the command that measured it, hardware, seed and
 date; and for each training run that a report names its settings, command and time.
@@ -21,17 +21,25 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "RESULTS.json"
 BASE, NOVEL = suite_tasks("ml10")
 SEEDS = ["seeds", "seed2"]  # the reports that hold the three seeds
-COLUMNS = {"small, 3 seeds": SEEDS, "the one in `assets/`": ["shipped"]}
-ABLATIONS = {  # run -> what is different in it
-    "ml10-small-seed0": "DAMI",
-    "multi-task": "no MAML at all (`--maml off`)",
-    "short-dami": "DAMI",
-    "short-first-order": "first order instead of second (`--maml first`)",
-    "short-mlp": "an MLP instead of VMT (`--demo-encoder mlp`)",
-    "short-mid": "TCFM in the middle of the U-Net (`--tcfm mid`)",
-    "short-dp3-maml": "DP3 + MAML (`--demo-encoder none --tcfm none`)",
-    "short-dp3": "multi-task DP3 (the same with `--maml off`)",
+CHECKPOINTS = ["top5-0", "top5-1", "top5-2"]  # those of every checkpoint of each seed
+BASE_COLUMNS = {"small, 3 seeds": SEEDS, "the one in `assets/`": ["shipped"]}
+NOVEL_COLUMNS = {
+    "small, 3 seeds": SEEDS,
+    "with 1000 steps": ["long-0", "long-1", "long-2"],
+    "the one in `assets/`": ["shipped"],
 }
+ABLATIONS = [  # what is different in it, reports
+    ("DAMI", SEEDS),
+    ("no MAML at all (`--maml off`)", ["eval-multi-task", "eval-multi-task-seed1", "eval-multi-task-seed2"]),
+    ("DAMI", ["eval-short-dami"]),
+    ("an inner rate 30 times as large (`--inner-lr 3e-3`)", ["eval-short-inner"]),
+    ("first order instead of second (`--maml first`)", ["eval-short-first-order"]),
+    ("an MLP instead of VMT (`--demo-encoder mlp`)", ["eval-short-mlp"]),
+    ("TCFM in the middle of the U-Net (`--tcfm mid`)", ["eval-short-mid"]),
+    ("TCFM in the last up-sampling level (`--tcfm up`)", ["eval-short-up"]),
+    ("DP3 + MAML (`--demo-encoder none --tcfm none`)", ["eval-short-dp3-maml"]),
+    ("multi-task DP3 (the same with `--maml off`)", ["eval-short-dp3"]),
+]
 
 
 def take(results: dict, folder: Path) -> None:
@@ -48,13 +56,27 @@ def take(results: dict, folder: Path) -> None:
         results["trainings"][run] = {"minutes": round(minutes, 1), **json.loads((path / "config.json").read_text())}
 
 
-def successes(results: dict, reports: list[str]) -> dict[str, Successes]:
-    """Label -> task -> episodes of reports."""
+def successes(results: dict, reports: list[str], kind: str = "successes") -> dict[str, Successes]:
+    """Label -> task -> episodes of reports: of the last checkpoints, or of all (kind `checkpoints`)."""
     return {
         label: {task: [c == "1" for c in episodes] for task, episodes in tasks.items()}
         for report in reports
-        for label, tasks in results["evaluations"][report]["successes"].items()
+        for label, tasks in results["evaluations"][report][kind].items()
     }
+
+
+def curves(results: dict) -> dict[str, dict[int, float]]:
+    """Run -> step -> mean success over base tasks, for each of its checkpoints."""
+    found: dict[str, dict[int, float]] = {}
+    for label, measured in successes(results, CHECKPOINTS, "checkpoints").items():
+        run, checkpoint = label.split("/")
+        found.setdefault(run, {})[int(checkpoint.removeprefix("ema-"))] = mean_success(only(measured, BASE))
+    return found
+
+
+def best_five(results: dict) -> str:
+    """The paper's number: the mean of the five best checkpoints of each run."""
+    return mean_interval([float(np.mean(sorted(curve.values())[-5:])) for curve in curves(results).values()])
 
 
 def only(results: Successes, tasks: list[str]) -> Successes:
@@ -67,8 +89,15 @@ def pooled(results: Successes, tasks: list[str]) -> str:
     return format_success(sum(episodes), len(episodes))
 
 
+def mean_of_runs(runs: list[Successes], tasks: list[str]) -> str:
+    """Student's interval over several runs; Wilson's over the episodes of one."""
+    if len(runs) == 1:
+        return pooled(runs[0], tasks)
+    return mean_interval([mean_success(only(run, tasks)) for run in runs])
+
+
 def seeds_table(results: dict, tasks: list[str], columns: dict[str, list[str]]) -> str:
-    """A row a task: the seeds' episodes together, a column for some reports; the means over seeds in the last row."""
+    """A row a task: the seeds' episodes together, a column for some reports; then the means over seeds."""
     lines = [f"| task | {' | '.join(columns)} | paper, DP3 | paper, DAMI |", "|---" * (len(columns) + 3) + "|"]
     runs = {title: list(successes(results, reports).values()) for title, reports in columns.items()}
     paper = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
@@ -76,26 +105,29 @@ def seeds_table(results: dict, tasks: list[str], columns: dict[str, list[str]]) 
     for task in tasks:
         cells = [pooled({task: [s for run in seeds for s in run[task]]}, [task]) for seeds in runs.values()]
         lines.append(f"| {task} | {' | '.join(cells)} | {dp3[task]:.1f} | {paper_success('ml10', task):.1f} |")
-    means = [mean_interval([mean_success(only(run, tasks)) for run in seeds]) for seeds in runs.values()]
+    means = [mean_of_runs(seeds, tasks) for seeds in runs.values()]
     ours = np.mean([paper_success("ml10", task) for task in tasks])
-    lines.append(f"| **mean** | {' | '.join(means)} | {np.mean(list(dp3.values())):.1f} | {ours:.1f} |")
+    of_paper = f"{np.mean(list(dp3.values())):.1f} | {ours:.1f} |"
+    lines.append(f"| **mean** | {' | '.join(means)} | {of_paper}")
+    if tasks == BASE:
+        lines.append(f"| mean, best 5 checkpoints | {best_five(results)}{' |' * len(columns)} {of_paper}")
     return "\n".join(lines)
 
 
 def ablation_table(results: dict) -> str:
-    """A row a run of seed 0: what is different in it, and its means over the base and over the novel tasks."""
+    """A row a variant: what is different in it, and its means over the base and over the novel tasks."""
     lines = ["| outer steps | variant | base | novel |", "|---|---|---|---|"]
-    measured = {label.split("/")[0]: run for label, run in successes(results, list(results["evaluations"])).items()}
-    for run, title in ABLATIONS.items():
-        steps = results["trainings"][run]["arguments"]["steps"]
-        cells = [pooled(measured[run], tasks) for tasks in (BASE, NOVEL)]
-        lines.append(f"| {steps} | {title} | {' | '.join(cells)} |")
+    for title, reports in ABLATIONS:
+        measured = successes(results, reports)
+        steps = {results["trainings"][label.split("/")[0]]["arguments"]["steps"] for label in measured}
+        cells = [mean_of_runs(list(measured.values()), tasks) for tasks in (BASE, NOVEL)]
+        lines.append(f"| {', '.join(map(str, steps))} | {title} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 TABLES = {
-    "base": lambda results: seeds_table(results, BASE, COLUMNS),
-    "novel": lambda results: seeds_table(results, NOVEL, COLUMNS),
+    "base": lambda results: seeds_table(results, BASE, BASE_COLUMNS),
+    "novel": lambda results: seeds_table(results, NOVEL, NOVEL_COLUMNS),
     "ablations": ablation_table,
 }
 
@@ -111,11 +143,22 @@ def fill(readme: str, results: dict) -> str:
 
 
 def draw(results: dict) -> None:
-    """assets/success.png."""
+    """assets/learning-curve.png and assets/success.png."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
+    for run, curve in curves(results).items():
+        axes.plot(*zip(*sorted(curve.items())), "o-", markersize=3, linewidth=1, label=f"seed {run[-1]}")
+    arguments = results["trainings"][run]["arguments"]
+    axes.axvline(arguments["steps"] * arguments["multi_task_share"], color="0.7", linestyle=":", label="MAML begins")
+    axes.set(xlabel="outer step", ylabel="mean success on base tasks, %", ylim=(0, 100))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
+    write_atomically(ROOT / "assets" / "learning-curve.png", lambda path: figure.savefig(path, dpi=110, format="png"))
+    plt.close(figure)
 
     figure, axes = plt.subplots(figsize=(9, 3.4), layout="constrained")
     tasks = BASE + NOVEL

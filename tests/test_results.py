@@ -35,6 +35,18 @@ def test_a_cell_of_the_ablation_table_can_be_recomputed_from_the_episodes():
     assert [float(x) for x in row.groups()] == pytest.approx([100 * e.count("1") / len(e) for e in expected], abs=0.051)
 
 
+def test_the_row_of_the_best_five_checkpoints_can_be_recomputed_from_the_episodes():
+    reports = json.loads(RESULTS.read_text())["evaluations"]
+    best = []
+    for seed in range(3):
+        checkpoints = reports[f"top5-{seed}"]["checkpoints"]
+        means = sorted(np.mean([e.count("1") / len(e) for e in run.values()]) for run in checkpoints.values())
+        assert len(means) == 10 and all(set(run) == set(BASE) for run in checkpoints.values())
+        best.append(100 * sum(means[5:]) / 5)
+    row = re.search(r"^\| mean, best 5 checkpoints \| ([\d.]+) ", README, re.M)
+    assert float(row[1]) == pytest.approx(sum(best) / 3, abs=0.051)
+
+
 def test_every_result_says_how_it_was_measured():
     results = json.loads(RESULTS.read_text())
     for report in results["evaluations"].values():
