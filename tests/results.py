@@ -10,6 +10,7 @@ date; and for each training run that a report names its settings, command and ti
 import json
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +57,7 @@ def take(results: dict, folder: Path) -> None:
         results["trainings"][run] = {"minutes": round(minutes, 1), **json.loads((path / "config.json").read_text())}
 
 
-def successes(results: dict, reports: list[str], kind: str = "successes") -> dict[str, Successes]:
+def successes(results: dict, reports: Sequence[str], kind: str = "successes") -> dict[str, Successes]:
     """Label -> task -> episodes of reports: of the last checkpoints, or of all (kind `checkpoints`)."""
     return {
         label: {task: [c == "1" for c in episodes] for task, episodes in tasks.items()}
@@ -65,18 +66,13 @@ def successes(results: dict, reports: list[str], kind: str = "successes") -> dic
     }
 
 
-def curves(results: dict) -> dict[str, dict[int, float]]:
-    """Run -> step -> mean success over base tasks, for each of its checkpoints."""
+def curves(results: dict, reports: Sequence[str], tasks: list[str]) -> dict[str, dict[int, float]]:
+    """Run -> step -> mean success over tasks, for each of its checkpoints."""
     found: dict[str, dict[int, float]] = {}
-    for label, measured in successes(results, CHECKPOINTS, "checkpoints").items():
+    for label, measured in successes(results, reports, "checkpoints").items():
         run, checkpoint = label.split("/")
-        found.setdefault(run, {})[int(checkpoint.removeprefix("ema-"))] = mean_success(only(measured, BASE))
+        found.setdefault(run, {})[int(checkpoint.removeprefix("ema-"))] = mean_success(only(measured, tasks))
     return found
-
-
-def best_five(results: dict) -> str:
-    """The paper's number: the mean of the five best checkpoints of each run."""
-    return mean_interval([float(np.mean(sorted(curve.values())[-5:])) for curve in curves(results).values()])
 
 
 def only(results: Successes, tasks: list[str]) -> Successes:
@@ -96,8 +92,11 @@ def mean_of_runs(runs: list[Successes], tasks: list[str]) -> str:
     return mean_interval([mean_success(only(run, tasks)) for run in runs])
 
 
-def seeds_table(results: dict, tasks: list[str], columns: dict[str, list[str]]) -> str:
-    """A row a task: the seeds' episodes together, a column for some reports; then the means over seeds."""
+def seeds_table(results: dict, tasks: list[str], columns: dict[str, list[str]], checkpoints: Sequence[str] = ()) -> str:
+    """A row a task: the seeds' episodes together, a column for some reports; then the means over seeds.
+
+    With the reports of every checkpoint also the paper's number: the mean of the five best checkpoints of each run.
+    """
     lines = [f"| task | {' | '.join(columns)} | paper, DP3 | paper, DAMI |", "|---" * (len(columns) + 3) + "|"]
     runs = {title: list(successes(results, reports).values()) for title, reports in columns.items()}
     paper = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
@@ -109,8 +108,9 @@ def seeds_table(results: dict, tasks: list[str], columns: dict[str, list[str]]) 
     ours = np.mean([paper_success("ml10", task) for task in tasks])
     of_paper = f"{np.mean(list(dp3.values())):.1f} | {ours:.1f} |"
     lines.append(f"| **mean** | {' | '.join(means)} | {of_paper}")
-    if tasks == BASE:
-        lines.append(f"| mean, best 5 checkpoints | {best_five(results)}{' |' * len(columns)} {of_paper}")
+    if checkpoints:
+        best = [float(np.mean(sorted(curve.values())[-5:])) for curve in curves(results, checkpoints, tasks).values()]
+        lines.append(f"| mean, best 5 checkpoints | {mean_interval(best)}{' |' * len(columns)} {of_paper}")
     return "\n".join(lines)
 
 
@@ -119,14 +119,14 @@ def ablation_table(results: dict) -> str:
     lines = ["| outer steps | variant | base | novel |", "|---|---|---|---|"]
     for title, reports in ABLATIONS:
         measured = successes(results, reports)
-        steps = {results["trainings"][label.split("/")[0]]["arguments"]["steps"] for label in measured}
+        (steps,) = {results["trainings"][label.split("/")[0]]["arguments"]["steps"] for label in measured}
         cells = [mean_of_runs(list(measured.values()), tasks) for tasks in (BASE, NOVEL)]
-        lines.append(f"| {', '.join(map(str, steps))} | {title} | {' | '.join(cells)} |")
+        lines.append(f"| {steps} | {title} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 TABLES = {
-    "base": lambda results: seeds_table(results, BASE, BASE_COLUMNS),
+    "base": lambda results: seeds_table(results, BASE, BASE_COLUMNS, CHECKPOINTS),
     "novel": lambda results: seeds_table(results, NOVEL, NOVEL_COLUMNS),
     "ablations": ablation_table,
 }
@@ -150,9 +150,9 @@ def draw(results: dict) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
-    for run, curve in curves(results).items():
-        axes.plot(*zip(*sorted(curve.items())), "o-", markersize=3, linewidth=1, label=f"seed {run[-1]}")
-    arguments = results["trainings"][run]["arguments"]
+    for run, curve in curves(results, CHECKPOINTS, BASE).items():
+        arguments = results["trainings"][run]["arguments"]
+        axes.plot(*zip(*sorted(curve.items())), "o-", markersize=3, linewidth=1, label=f"seed {arguments['seed']}")
     axes.axvline(arguments["steps"] * arguments["multi_task_share"], color="0.7", linestyle=":", label="MAML begins")
     axes.set(xlabel="outer step", ylabel="mean success on base tasks, %", ylim=(0, 100))
     axes.spines[["top", "right"]].set_visible(False)

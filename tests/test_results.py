@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evaluate import wilson_interval
-from tests.results import BASE, NOVEL, RESULTS, ROOT, fill
+from tests.results import ABLATIONS, BASE, NOVEL, NOVEL_COLUMNS, RESULTS, ROOT, fill, successes
 
 README = (ROOT / "README.md").read_text()
 
@@ -45,6 +45,20 @@ def test_the_row_of_the_best_five_checkpoints_can_be_recomputed_from_the_episode
         best.append(100 * sum(means[5:]) / 5)
     row = re.search(r"^\| mean, best 5 checkpoints \| ([\d.]+) ", README, re.M)
     assert float(row[1]) == pytest.approx(sum(best) / 3, abs=0.051)
+
+
+def test_rows_and_columns_are_of_the_runs_that_they_name():
+    results = json.loads(RESULTS.read_text())
+    for title, reports in ABLATIONS:
+        runs = [results["trainings"][label.split("/")[0]] for label in successes(results, reports)]
+        flags = re.findall(r"`(--.*?)`", title)
+        variants = flags or ["--maml", "--demo-encoder", "--tcfm", "--inner-lr"]
+        assert all((flag in run["command"]) == bool(flags) for run in runs for flag in variants), title
+        assert [run["arguments"]["seed"] for run in runs] == list(range(len(runs)))
+        assert all(results["evaluations"][report]["facts"]["adaptation steps"] == 200 for report in reports)
+    for title, reports in NOVEL_COLUMNS.items():
+        steps = {results["evaluations"][report]["facts"]["adaptation steps"] for report in reports}
+        assert steps == {1000 if "1000" in title else 200}
 
 
 def test_every_result_says_how_it_was_measured():
