@@ -1,21 +1,23 @@
 """Success rates: rollouts in Meta-World, confidence intervals, tables, charts and animations.
 
-    python evaluate.py                                        # base tasks of the newest run's last checkpoint
-    python evaluate.py --split all                            # and the novel tasks, each after adaptation
-    python evaluate.py --checkpoint runs/a runs/b --top 5     # all checkpoints of several runs (seeds): last, and best 5
-    python evaluate.py --task reach --gif reach.gif           # watch one rollout
+    python evaluate.py                                       # base tasks, the newest run
+    python evaluate.py --checkpoint runs/a runs/b --top 5    # all checkpoints of two runs
+    python evaluate.py --task reach --gif reach.gif          # watch one rollout
 
-An episode succeeds if any of its 200 steps reports success, so a rollout ends there. Base tasks are evaluated by direct
-inference, novel tasks after adaptation (Algorithm 2), each rollout with one reference demonstration, drawn from the
-task's own and held. Goals come from seeds that no demonstration uses.
+An episode succeeds if any of its 200 steps reports success, so a rollout ends there. Each rollout
+holds one reference demonstration, drawn from the task's own. Goals come from seeds that no
+demonstration uses. Nothing is adapted here: novel tasks are finetune.py's.
 
-Letters: E episodes rolled out side by side, To = 2 observation steps, Ta = 8 executed actions, N points, A action dim.
+One action, from the network to the simulated arm: `rollout` keeps two frames of each episode,
+`DAMIPolicy.sample_actions` draws eight actions, `MetaWorldPointCloudEnv.advance` takes them.
+
+Letters: E episodes rolled out side by side, To = 2 observation steps, Ta = 8 executed actions,
+N points, A action dim, S state dim.
 """
 
 import argparse
 import json
 import math
-import multiprocessing
 import os
 import platform
 import shlex
@@ -23,50 +25,45 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from torch import Tensor
-from tqdm import tqdm
 
-from data import (
-    Demonstrations,
-    InputError,
+from clip import text_features
+from data import WindowSampler, command_line, load_demonstrations, write_atomically
+from model import DAMIPolicy, load_checkpoint
+from simulator import (
     MetaWorldPointCloudEnv,
-    WindowSampler,
     check_task,
     collect,
-    command_line,
     evaluation_seed,
-    load_demonstrations,
+    run_jobs,
     suite_tasks,
+    worker,
 )
-from model import DAMIPolicy, load_checkpoint, load_clip_text_encoder
-from model import InputError as ModelInputError
 
-EPISODES_A_JOB = 10  # rolled out side by side in one process; part of the protocol, since it shapes the noise drawn
+EPISODES_A_JOB = 10  # side by side in one process; part of the protocol: it shapes the noise drawn
 PAPER_RESULTS = Path(__file__).parent / "assets" / "paper_results.json"
 SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
+TRAINED = ("suite", "preset", "arguments", "text_weights", "step")  # what train.py's files say
 
 Successes = dict[str, list[bool]]  # task -> one entry an episode
 
 
-# ---- Figures ---------------------------------------------------------------------------------------------------------
+# ---- Figures -------------------------------------------------------------------------------------
 
 
 def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a success rate, as two fractions. Raises ValueError without episodes."""
-    if episodes < 1:
-        raise ValueError("an interval needs at least one episode")
-    z, p = 1.959964, successes / episodes
-    center = p + z**2 / (2 * episodes)
-    margin = z * math.sqrt(p * (1 - p) / episodes + z**2 / (4 * episodes**2))
-    scale = 1 + z**2 / episodes
-    return max(0.0, (center - margin) / scale), min(1.0, (center + margin) / scale)
+    """Returns Wilson's 95 % interval of a success rate, as two fractions."""
+    from scipy.stats import binomtest  # comes with metaworld; takes a second to import
+
+    interval = binomtest(successes, episodes).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def format_success(successes: int, episodes: int) -> str:
@@ -75,112 +72,97 @@ def format_success(successes: int, episodes: int) -> str:
     return f"{100 * successes / episodes:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
-def mean_success(successes: Successes) -> float:
+def pooled_success(results: Successes) -> str:
+    """The episodes of all tasks together, as `format_success` writes them."""
+    episodes = [success for task in results.values() for success in task]
+    return format_success(sum(episodes), len(episodes))
+
+
+def mean_success(results: Successes) -> float:
     """The mean over tasks of the success rate, in percent."""
-    return 100 * float(np.mean([np.mean(episodes) for episodes in successes.values()]))
+    return 100 * float(np.mean([np.mean(episodes) for episodes in results.values()]))
 
 
-# ---- Preparation -----------------------------------------------------------------------------------------------------
+def mean_interval(values: Sequence[float]) -> str:
+    """Mean over runs with Student's 95 % interval, in the unit of the values."""
+    if len(values) == 1:
+        return f"{values[0]:.1f} (one run)"
+    from scipy.stats import t
+
+    margin = t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
+    return f"{np.mean(values):.1f} ± {margin:.1f} ({len(values)} runs)"
+
+
+# ---- What to measure, and on what ----------------------------------------------------------------
 
 
 def pick_device(name: str | None) -> torch.device:
-    """`cuda` where there is one unless a name is given. Raises InputError for a device that is not there."""
+    """`cuda` where there is one unless a name is given; ValueError for a missing device."""
     name = name or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).split("\n")[0]
-        raise InputError(f"--device {name} cannot be used here ({reason}): use --device cpu") from error
+        raise ValueError(
+            f"--device {name} cannot be used here ({reason}): use --device cpu"
+        ) from error
     return device
 
 
-def newest_checkpoint(runs: str | Path = "runs") -> Path:
-    """The last EMA checkpoint of the run that was written to last; without any, the one of the repository, said so.
+def hardware(device: str | torch.device = "cpu") -> str:
+    """The processor that results are measured on."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_name(device)
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(
+            line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")
+        )
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
+    return f"{name}, {os.cpu_count()} cores"
 
-    Raises InputError if that is missing, too.
+
+def checkpoints_of(path: str | Path) -> list[Path]:
+    """A file as it is; of a run's folder all its EMA checkpoints, the last one last."""
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    if not (found := sorted(path.glob("ema-*.pt")) or sorted(path.glob("adapted.pt"))):
+        raise ValueError(f"{path} holds no checkpoint: name a folder of train.py, or a .pt file")
+    return found
+
+
+def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
+    """The last checkpoint of the newest finished run on `suite`; without any, the one that ships.
+
+    Runs of `tiny` do not count: they show that everything works and learn next to nothing.
     """
-    checkpoints = sorted(Path(runs).glob("*/ema-*.pt"), key=lambda path: (path.stat().st_mtime, path.name))
-    if checkpoints:
-        return checkpoints[-1]
-    if not SHIPPED_CHECKPOINT.is_file():
-        raise InputError(f"no checkpoint in {runs}/: run `python train.py --suite ml10` first, or name a --checkpoint")
-    print(f"no checkpoint in {runs}/: using the one that comes with the code, {SHIPPED_CHECKPOINT.name}", flush=True)
+    finished = []
+    for config in Path(runs).glob("*/config.json"):
+        arguments = json.loads(config.read_text()).get("arguments", {})
+        last = config.parent / f"ema-{arguments.get('steps', 0):05d}.pt"
+        if arguments.get("suite") == suite and arguments["preset"] != "tiny" and last.is_file():
+            finished.append(last)
+    if finished:
+        return max(finished, key=lambda path: path.stat().st_mtime)
+    if suite != "ml10" or not SHIPPED_CHECKPOINT.is_file():
+        raise ValueError(
+            f"no finished run on {suite} in {runs}/: train one, or name a --checkpoint"
+        )
+    print(f"no finished run in {runs}/: using the policy that comes with the code", flush=True)
     return SHIPPED_CHECKPOINT
 
 
-def load_trained(path: str | Path, device: str | torch.device = "cpu") -> tuple[DAMIPolicy, dict[str, Any]]:
-    """`model.load_checkpoint`, for a file that says how it was trained. Raises InputError for one that does not."""
-    policy, info = load_checkpoint(path, device)
-    needed = ("suite", "preset", "arguments", "text_weights", "step")
-    if missing := [name for name in needed if name not in info]:
-        raise InputError(f"{path} does not say its {', '.join(missing)}: use a checkpoint of train.py or finetune.py")
-    return policy, info
+def claim_folder(folder: Path, kept: str, overwrite: bool) -> None:
+    """Makes a folder for results; ValueError if `kept` is in it and may not be overwritten."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if (folder / kept).exists() and not overwrite:
+        raise ValueError(f"{folder} already holds {kept}: add --overwrite, or choose another --out")
 
 
-def text_features(instructions: Sequence[str], weights: str | None, identity: str | None = None) -> tuple[Tensor, str]:
-    """Encodes instructions with CLIP's frozen text tower, once.
-
-    Args:
-        instructions: plain sentences.
-        weights: the value of --clip-weights: a file, `random`, or None for what is there.
-        identity: the text weights that a checkpoint was made with. No others are accepted, and if they were random
-            ones, the same are drawn again without looking for CLIP's.
-
-    Returns:
-        (features (len(instructions), 512) float32 on the CPU, identity of the weights).
-
-    Raises:
-        InputError: the weights that can be had are not those of the checkpoint.
-    """
-    if weights is None and identity is not None and identity.startswith("random"):
-        weights = "random"
-    encoder = load_clip_text_encoder(weights)
-    if identity is not None and encoder.identity != identity:
-        raise InputError(
-            f"the checkpoint was made with the text weights {identity!r}, here are {encoder.identity!r}: "
-            "give the same ones with --clip-weights"
-        )
-    return encoder.encode(list(instructions)), encoder.identity
-
-
-def window_sampler(
-    policy: DAMIPolicy, demonstrations: Demonstrations, after_success: int | None = None, augment: bool = False
-) -> WindowSampler:
-    """The sampler of one task's demonstrations with this policy's horizon, points and stride, on its device.
-
-    `after_success` and `augment` are for training, as in `WindowSampler`.
-
-    Raises InputError where policy and demonstrations disagree.
-    """
-    config, device = policy.config, next(policy.parameters()).device
-    found = (demonstrations.state.shape[1], demonstrations.action.shape[1])
-    if found != (config.state_dim, config.action_dim):
-        raise InputError(
-            f"{demonstrations.task}: state and action have {found[0]} and {found[1]} dimensions, the policy "
-            f"{config.state_dim} and {config.action_dim}: use a checkpoint trained on such data"
-        )
-    sampler = WindowSampler(
-        demonstrations,
-        config.horizon,
-        config.n_obs_steps,
-        config.n_action_steps,
-        config.num_points,
-        config.demo_stride,
-        device,
-        after_success,
-        augment,
-    )
-    longest = max(math.ceil((e.stop - e.start) / config.demo_stride) for e in sampler.episodes)
-    if config.demo_encoder != "none" and longest > config.demo_positions:
-        raise InputError(
-            f"{demonstrations.task}: a demonstration has {longest} frames (every {config.demo_stride}th of it), the "
-            f"policy {config.demo_positions} positions: cut it, or train with more positions or a larger stride"
-        )
-    return sampler
-
-
-# ---- Rollouts --------------------------------------------------------------------------------------------------------
+# ---- Rollouts ------------------------------------------------------------------------------------
 
 
 def rollout(
@@ -194,7 +176,8 @@ def rollout(
 ) -> list[bool]:
     """Rolls out E episodes of one task side by side, and says which of them succeeded.
 
-    The demonstrations are encoded once. The policy reads To frames in every Ta: in the others no ray is cast.
+    The demonstrations are encoded once. The policy reads To frames in every Ta: in the others no
+    ray is cast.
 
     Args:
         policy: in evaluation mode.
@@ -202,34 +185,42 @@ def rollout(
         sampler: of the task's demonstrations, from which one a rollout is drawn.
         text: instruction feature, (text_dim,).
         generator: draws demonstrations and noise; on the CPU.
-        on_chunk: called with (index of the environment, observation) before each chunk, for pictures.
+        on_chunk: called with (index of the environment, observation) before each chunk.
 
     Returns:
         E booleans.
     """
     To, device = policy.config.n_obs_steps, text.device
-    drawn = [sampler.demonstration(generator) for _ in envs]  # held for the whole rollout
-    contexts = []
-    for demo in drawn:  # one at a time: they may differ in length
-        with torch.no_grad():
-            contexts.append(
-                policy.encode_demo(text[None], *(demo[name][None] for name in ("points", "state", "action")))
-            )
-    frames = [[env.reset(seed=seed)[0]] * To for env, seed in zip(envs, seeds)]  # the first frame, repeated
+
+    # One reference demonstration a rollout, held. All are drawn before any noise is; they are
+    # encoded one at a time, since they may differ in length.
+    demos = [sampler.demonstration(generator) for _ in envs]
+    with torch.no_grad():
+        contexts = [policy.encode_demo(text[None], **demo) for demo in demos]
+
+    frames = [[env.reset(seed=seed)[0]] * To for env, seed in zip(envs, seeds)]  # the first, twice
     success, running = [False] * len(envs), list(range(len(envs)))
     while running:
-        points = torch.from_numpy(np.stack([[f["point_cloud"] for f in frames[e]] for e in running]))  # (E, To, N, 3)
-        state = torch.from_numpy(np.stack([[f["agent_pos"] for f in frames[e]] for e in running]))  # (E, To, S)
+        points = np.stack([[f["point_cloud"] for f in frames[e]] for e in running])  # (E, To, N, 3)
+        state = np.stack([[f["agent_pos"] for f in frames[e]] for e in running])  # (E, To, S)
         if on_chunk is not None:
             for e in running:
                 on_chunk(e, frames[e][-1])
-        chunks = sample_chunks(policy, points.to(device), state.to(device), [contexts[e] for e in running], generator)
+
+        chunks = sample_chunks(
+            policy,
+            torch.from_numpy(points).to(device),
+            torch.from_numpy(state).to(device),
+            [contexts[e] for e in running],
+            generator,
+        )  # (E, Ta, A)
+
         for e, chunk in zip(list(running), chunks):
             frames[e] = []
             for step, action in enumerate(chunk, start=1):
                 _, truncated, info = envs[e].advance(action)
                 success[e] = success[e] or info["success"]
-                if success[e] or truncated:
+                if success[e] or truncated:  # a later step cannot undo a success
                     running.remove(e)
                     break
                 if step > len(chunk) - To:
@@ -238,43 +229,57 @@ def rollout(
 
 
 def sample_chunks(
-    policy: DAMIPolicy, points: Tensor, state: Tensor, contexts: Sequence, generator: torch.Generator
+    policy: DAMIPolicy,
+    points: Tensor,
+    state: Tensor,
+    contexts: Sequence,
+    generator: torch.Generator,
 ) -> np.ndarray:
-    """Action chunks (E, Ta, A) float32 for observations (E, To, N, 3), (E, To, S) and one context each."""
+    """Action chunks (E, Ta, A) for observations (E, To, N, 3), (E, To, S) and one context each."""
     if contexts[0] is None:  # this architecture reads no task
         return policy.sample_actions(points, state, None, generator).cpu().numpy()
     if len({context[0].shape for context in contexts}) > 1:  # demonstrations of different lengths
-        each = [policy.sample_actions(p[None], s[None], c, generator) for p, s, c in zip(points, state, contexts)]
+        each = [
+            policy.sample_actions(p[None], s[None], context, generator)
+            for p, s, context in zip(points, state, contexts)
+        ]
         return torch.cat(each).cpu().numpy()
     context = tuple(torch.cat(parts) for parts in zip(*contexts))
     return policy.sample_actions(points, state, context, generator).cpu().numpy()
 
 
-# ---- Evaluation in worker processes ----------------------------------------------------------------------------------
+# ---- Evaluation in worker processes --------------------------------------------------------------
 
-worker: dict[str, Any] = {}  # what a worker process keeps between jobs: policy and environments
-
-
-def start_worker(checkpoint: str, device: str) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the starting process's business
-    torch.set_num_threads(1)  # one process a core
-    worker.update(policy=load_checkpoint(checkpoint, device)[0], task=None)
+loaded: dict[str, Any] = {}  # what a worker process keeps between jobs: policy and environments
 
 
-def run_job(
-    task: str, data: str, n_demonstrations: int | None, text: np.ndarray, seed: int, first: int, episodes: int
+def load_policy(checkpoint: str, device: str) -> None:
+    """Sets up a worker process."""
+    loaded.update(policy=load_checkpoint(checkpoint, device)[0], task=None)
+
+
+def rollout_job(
+    task: str, data: str, n_demonstrations: int | None, text: np.ndarray, seeds: list[int]
 ) -> list[bool]:
-    """Episodes first ... first + episodes - 1 of one task."""
-    policy = worker["policy"]
-    if worker["task"] != task:
-        demonstrations = load_demonstrations(data).first(n_demonstrations)
-        worker.update(task=task, sampler=window_sampler(policy, demonstrations), envs=[])
-    while len(worker["envs"]) < episodes:
-        worker["envs"].append(MetaWorldPointCloudEnv(task, policy.config.num_points))
-    seeds = [evaluation_seed(seed, first + i) for i in range(episodes)]
-    generator = torch.Generator().manual_seed(seeds[0])
-    text = torch.from_numpy(text).to(worker["sampler"].state.device)
-    return rollout(policy, worker["envs"][:episodes], seeds, worker["sampler"], text, generator)
+    """Rolls out the episodes of these seeds, of one task, in a worker process."""
+    policy = loaded["policy"]
+    device = policy.normalizer.action_scale.device
+    if loaded["task"] != task:
+        demonstrations = load_demonstrations(data).take(n_demonstrations)
+        sampler = WindowSampler(demonstrations, policy.config, device)
+        loaded.update(task=task, sampler=sampler, envs=[])
+    while len(loaded["envs"]) < len(seeds):
+        loaded["envs"].append(MetaWorldPointCloudEnv(task, policy.config.num_points))
+
+    def on_chunk(*_: Any) -> None:
+        if worker.stop.is_set():  # Ctrl-C in the starting process
+            raise InterruptedError("evaluation was interrupted")
+
+    envs, generator = loaded["envs"][: len(seeds)], torch.Generator().manual_seed(seeds[0])
+    text = torch.from_numpy(text).to(device)
+    success = rollout(policy, envs, seeds, loaded["sampler"], text, generator, on_chunk)
+    worker.finished.put((task, len(seeds)))
+    return success
 
 
 def evaluate(
@@ -300,48 +305,38 @@ def evaluate(
         n_demonstrations: use only the first so many of each file; None: all.
 
     Returns:
-        task -> E booleans, in the order of the episodes. They do not depend on the number of workers.
+        task -> E booleans, in the order of the episodes. They do not depend on `workers`.
     """
     if episodes < 1:
-        raise InputError(f"--episodes is {episodes}: evaluate at least 1")
+        raise ValueError(f"--episodes is {episodes}: use at least 1")
+    seeds = [evaluation_seed(seed, i) for i in range(episodes)]
+    chunks = [seeds[i : i + EPISODES_A_JOB] for i in range(0, episodes, EPISODES_A_JOB)]
     jobs = [
-        (
-            task,
-            str(path),
-            n_demonstrations,
-            text[task].cpu().numpy(),
-            seed,
-            first,
-            min(EPISODES_A_JOB, episodes - first),
-        )
+        (task, str(path), n_demonstrations, text[task].cpu().numpy(), chunk)
         for task, path in demonstrations.items()
-        for first in range(0, episodes, EPISODES_A_JOB)
+        for chunk in chunks
     ]
-    if workers is not None and workers < 1:
-        raise InputError(f"--workers is {workers}: use at least 1")
-    workers = min(workers or os.cpu_count() or 1, len(jobs))
-    results: dict[str, dict[int, list[bool]]] = {task: {} for task in demonstrations}
-    with (
-        ProcessPoolExecutor(
-            workers, multiprocessing.get_context("spawn"), start_worker, (str(checkpoint), str(device))
-        ) as pool,
-        tqdm(total=len(demonstrations) * episodes, desc="evaluating", unit="episode", dynamic_ncols=True) as progress,
-    ):
-        try:
-            pending = {pool.submit(run_job, *job): job for job in jobs}
-            for future in as_completed(pending):
-                task, first = pending[future][0], pending[future][5]
-                results[task][first] = future.result()
-                progress.update(len(results[task][first]))
-        except BrokenProcessPool:
-            raise InputError("an evaluating process was killed, perhaps for memory: try fewer --workers") from None
-        except BaseException:
-            pool.shutdown(cancel_futures=True)  # what is running ends first: at most a few seconds
-            raise
-    return {task: [s for first in sorted(parts) for s in parts[first]] for task, parts in results.items()}
+    setup = (load_policy, str(checkpoint), str(device))
+    found = run_jobs(
+        rollout_job, jobs, workers, len(demonstrations) * episodes, "evaluating", setup
+    )
+
+    results: Successes = {task: [] for task in demonstrations}
+    for (task, *_), successes in zip(jobs, found):
+        results[task] += successes
+    return results
 
 
-# ---- Reports ---------------------------------------------------------------------------------------------------------
+# ---- Reports -------------------------------------------------------------------------------------
+
+
+def report_facts(
+    script: str, argv: Sequence[str] | None, device: str | torch.device
+) -> dict[str, str]:
+    """What stands beside every number: the hardware, the date, and the command that made it."""
+    command = shlex.join(["python", script, *(sys.argv[1:] if argv is None else argv)])
+    date = time.strftime("%Y-%m-%d")
+    return {"hardware": hardware(device), "date": date, "command": command}
 
 
 def paper_success(suite: str | None, task: str) -> float | None:
@@ -354,26 +349,26 @@ def paper_success(suite: str | None, task: str) -> float | None:
 
 
 def success_table(columns: dict[str, Successes], suite: str | None = None) -> str:
-    """A Markdown table: a row a task, a column for each set of results, and the paper's beside them; then the mean."""
+    """A Markdown table: a row a task, a column for each set of results, the paper's; the mean."""
     tasks = list(next(iter(columns.values())))
     paper = {task: paper_success(suite, task) for task in tasks}
     lines = [f"| task | {' | '.join(columns)} | paper |", "|---" * (len(columns) + 2) + "|"]
     for task in tasks:
-        cells = [format_success(sum(results[task]), len(results[task])) for results in columns.values()]
-        lines.append(f"| {task} | {' | '.join(cells)} | {'' if paper[task] is None else f'{paper[task]:.1f}'} |")
+        cells = [pooled_success({task: results[task]}) for results in columns.values()]
+        known = "" if paper[task] is None else f"{paper[task]:.1f}"
+        lines.append(f"| {task} | {' | '.join(cells)} | {known} |")
     if len(tasks) > 1:
-        cells = []
-        for results in columns.values():
-            flat = [success for episodes in results.values() for success in episodes]
-            cells.append(format_success(sum(flat), len(flat)))
+        cells = [pooled_success(results) for results in columns.values()]
         known = [value for value in paper.values() if value is not None]
         mean = f"{np.mean(known):.1f}" if len(known) == len(tasks) else ""
         lines.append(f"| **mean** | {' | '.join(cells)} | {mean} |")
     return "\n".join(lines)
 
 
-def draw_success(columns: dict[str, Successes], path: Path, title: str, suite: str | None = None) -> None:
-    """A bar chart of success rates with their Wilson intervals, a group a task, the paper's beside them."""
+def draw_success(
+    columns: dict[str, Successes], path: Path, title: str, suite: str | None = None
+) -> None:
+    """A bar chart of success with Wilson intervals, a group a task, the paper's beside them."""
     from matplotlib.figure import Figure
 
     tasks = list(next(iter(columns.values())))
@@ -381,37 +376,24 @@ def draw_success(columns: dict[str, Successes], path: Path, title: str, suite: s
     figure = Figure(figsize=(max(4.5, 2 + 0.9 * len(tasks)), 3.6), layout="constrained")
     axes = figure.subplots()
     x, width = np.arange(len(tasks)), 0.8 / groups
+
     for i, (label, results) in enumerate(columns.items()):
         rates = np.array([np.mean(results[task]) for task in tasks])
-        bounds = np.array([wilson_interval(sum(results[task]), len(results[task])) for task in tasks]).T
-        errors = 100 * np.abs(bounds - rates)
-        axes.bar(x + i * width, 100 * rates, width, yerr=errors, capsize=2, label=label, error_kw={"linewidth": 0.8})
+        bounds = [wilson_interval(sum(results[task]), len(results[task])) for task in tasks]
+        errors = 100 * np.abs(np.array(bounds).T - rates)  # (2, tasks)
+        style = {"capsize": 2, "error_kw": {"linewidth": 0.8}}
+        axes.bar(x + i * width, 100 * rates, width, yerr=errors, label=label, **style)
+
     paper = [paper_success(suite, task) for task in tasks]
     if any(value is not None for value in paper):
-        axes.bar(
-            x + len(columns) * width, [value or 0 for value in paper], width, color="0.8", label="paper (GPU, 258 M)"
-        )
+        heights = [value or 0 for value in paper]
+        axes.bar(x + len(columns) * width, heights, width, color="0.8", label="paper (on a GPU)")
+
     axes.set_xticks(x + width * (groups - 1) / 2, tasks, rotation=30, ha="right")
     axes.set(ylabel="success, %", ylim=(0, 105), title=title)
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(frameon=False, ncols=groups, loc="outside upper center", fontsize=8)
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
-
-
-def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
-    """Calls `write` with a temporary name beside `path`, then renames: the file is complete or the old one."""
-    path = Path(path)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # with its suffix: some writers go by it
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def command(script: str, argv: Sequence[str] | None) -> str:
-    """The command line that a script was started with, for its report."""
-    return shlex.join(["python", script, *(sys.argv[1:] if argv is None else argv)])
 
 
 def write_report(
@@ -421,38 +403,115 @@ def write_report(
     suite: str | None = None,
     checkpoints: dict[str, Successes] | None = None,
 ) -> str:
-    """Writes success.json (every episode, and how it was measured), success.md and success.png; returns the table.
+    """Writes success.json (every episode, how it was measured), .md, .png; returns the table.
 
     `checkpoints`: what else was measured and is only kept in success.json.
     """
     table = success_table(columns, suite)
     note = ", ".join(f"{name} {value}" for name, value in facts.items())
-    text = f"{table}\n\nPercent of episodes, 95 % Wilson interval. {note}.\n"
+    report = {"facts": facts, "successes": columns}
+    if checkpoints:
+        report["checkpoints"] = checkpoints
     folder.mkdir(parents=True, exist_ok=True)
-    report = {"facts": facts, "successes": columns} | ({"checkpoints": checkpoints} if checkpoints else {})
-    write_atomically(folder / "success.json", lambda temporary: temporary.write_text(json.dumps(report, indent=1)))
-    write_atomically(folder / "success.md", lambda temporary: temporary.write_text(text))
-    draw_success(columns, folder / "success.png", facts.get("title", "Success in Meta-World"), suite)
+    write_text(folder / "success.json", json.dumps(report, indent=1))
+    text = f"{table}\n\nPercent of episodes, 95 % Wilson interval. {note}.\n"
+    write_text(folder / "success.md", text)
+    draw_success(columns, folder / "success.png", facts.get("title", "Success"), suite)
     return table
 
 
-def hardware(device: str | torch.device = "cpu") -> str:
-    """The processor that results were measured on."""
-    if torch.device(device).type == "cuda":
-        return torch.cuda.get_device_name(device)
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        name = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        name = platform.processor() or platform.machine()
-    return f"{name}, {os.cpu_count()} cores"
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file, atomically."""
+    write_atomically(path, lambda temporary: temporary.write_text(text))
 
 
-# ---- Pictures --------------------------------------------------------------------------------------------------------
+def draw_curves(folder: Path) -> None:
+    """Draws curves.png of a run: the query loss, its running mean, and success where measured."""
+    from matplotlib.figure import Figure
+
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    steps = np.array([line["step"] for line in lines if "loss" in line])
+    losses = np.array([line["loss"] for line in lines if "loss" in line])
+    evaluated = [(line["step"], line["success"]) for line in lines if "success" in line]
+
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(steps, losses, color="C0", alpha=0.3, linewidth=0.8, label="query loss")
+    width = max(1, len(losses) // 50)
+    mean = np.convolve(losses, np.ones(width) / width, mode="valid")
+    axes.plot(steps[width - 1 :], mean, color="C0", label=f"mean of {width} steps")
+    axes.set(xlabel="outer step", ylabel="loss (actions in [-1, 1])", yscale="log")
+    axes.spines["top"].set_visible(False)
+    handles, labels = axes.get_legend_handles_labels()
+    if evaluated:
+        right = axes.twinx()
+        (line,) = right.plot(*zip(*evaluated), "o-", color="C1")
+        right.set(ylabel="mean success on base tasks, %", ylim=(0, 100))
+        right.spines["top"].set_visible(False)
+        handles, labels = [*handles, line], [*labels, "success (right)"]
+    axes.legend(handles, labels, frameon=False)
+
+    path = folder / "curves.png"
+    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
 
 
-def write_gif(policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, seed: int, path: str | Path) -> bool:
-    """Rolls out one episode and writes it as an animation: the ray-cast picture beside the cloud the policy sees.
+# ---- Runs ----------------------------------------------------------------------------------------
+
+
+def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int, int]:
+    """Joins the processes of torchrun, which share the tasks; returns (device, rank, how many).
+
+    One of them, the leader, collects, logs, saves and evaluates, while the others wait for it.
+    """
+    world, rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
+    if world > tasks:
+        raise ValueError(f"{world} processes for {tasks} tasks: use at most one a task")
+    if world > 1:
+        if device.type == "cuda" and device.index is None:
+            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        dist.init_process_group(backend, timeout=timedelta(hours=6))  # an evaluation is long
+    return device, rank, world
+
+
+class StopRequest:
+    """Turns the first Ctrl-C into a request to stop after the step at hand; the second stops."""
+
+    def __enter__(self) -> "StopRequest":
+        self.requested = False
+        self.previous = signal.signal(signal.SIGINT, self.handle)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        signal.signal(signal.SIGINT, self.previous)
+
+    def handle(self, *_: Any) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+def log(folder: Path, **values: Any) -> None:
+    """Appends a line to metrics.jsonl."""
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps(values) + "\n")
+
+
+def rewind_metrics(folder: Path, step: int) -> None:
+    """Drops the lines that a killed run wrote after its last save; all of them for step 0."""
+    path = folder / "metrics.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
+    write_text(path, "".join(f"{line}\n" for line in kept))
+
+
+# ---- Animations ----------------------------------------------------------------------------------
+
+
+def write_gif(
+    policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, seed: int, path: str | Path
+) -> bool:
+    """Rolls out one episode and animates it: the ray-cast picture beside the cloud the policy sees.
 
     Returns whether the episode succeeded.
     """
@@ -465,9 +524,11 @@ def write_gif(policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, seed: in
     def on_chunk(_: int, observation: dict) -> None:
         frames.append((env.render(), observation["point_cloud"]))
 
-    generator = torch.Generator().manual_seed(evaluation_seed(seed, 0))
-    (success,) = rollout(policy, [env], [evaluation_seed(seed, 0)], sampler, text, generator, on_chunk)
+    goal = evaluation_seed(seed, 0)
+    generator = torch.Generator().manual_seed(goal)
+    (success,) = rollout(policy, [env], [goal], sampler, text, generator, on_chunk)
     on_chunk(0, env.observe())  # how it ended
+
     clouds = np.concatenate([cloud for _, cloud in frames])
     low, high = clouds.min(0), clouds.max(0)
     figure = Figure(figsize=(6, 3), layout="constrained")
@@ -489,135 +550,115 @@ def write_gif(policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, seed: in
         step = min(index * policy.config.n_action_steps, env.steps)
         right.set_title(f"{policy.config.num_points} points, step {step}", fontsize=9)
 
-    animation = FuncAnimation(figure, draw, frames=[*range(len(frames)), len(frames) - 1, len(frames) - 1])
-    write_atomically(path, lambda temporary: animation.save(temporary, writer=PillowWriter(fps=8), dpi=70))
+    shown = [*range(len(frames)), len(frames) - 1, len(frames) - 1]  # the end stays a while
+    animation = FuncAnimation(figure, draw, frames=shown)
+    write_atomically(path, lambda name: animation.save(name, writer=PillowWriter(fps=8), dpi=70))
     return success
 
 
-# ---- Command line ----------------------------------------------------------------------------------------------------
-
-
-def checkpoints_of(path: str | Path, top: int) -> list[Path]:
-    """A file as it is; of a run's folder its last EMA checkpoint, or all of them if the best `top` are wanted."""
-    path = Path(path)
-    if not path.is_dir():
-        return [path]
-    found = sorted(path.glob("ema-*.pt"))
-    if not found:
-        raise InputError(f"{path} holds no ema-*.pt: name a run folder of train.py, or a checkpoint file")
-    if top > len(found):
-        raise InputError(
-            f"{path} holds {len(found)} checkpoints, --top asks for the best {top}: train.py keeps one every --checkpoint-every steps"
-        )
-    return found if top else found[-1:]
-
-
-def mean_interval(values: Sequence[float]) -> str:
-    """Mean over runs with its 95 % interval by Student's t, in the unit of the values; of one run just the value."""
-    if len(values) == 1:
-        return f"{values[0]:.1f} (one run)"
-    from scipy.stats import t  # comes with metaworld
-
-    margin = t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
-    return f"{np.mean(values):.1f} ± {margin:.1f} ({len(values)} runs)"
+# ---- Command line --------------------------------------------------------------------------------
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Measure success in Meta-World.")
-    parser.add_argument("--checkpoint", nargs="+", help="files or run folders (default: the newest run's last)")
-    parser.add_argument(
-        "--split", choices=("base", "novel", "all"), default="base", help="novel tasks: after adaptation"
+    parser = argparse.ArgumentParser(description="Measures success in Meta-World.")
+    add = parser.add_argument
+    add("--checkpoint", nargs="+", help="files or run folders (default: the newest run's last)")
+    add("--suite", help="ml10 or ml45 (default: the checkpoint's, or ml10)")
+    add("--split", choices=("base", "novel", "all"), default="base", help="which of its tasks")
+    add("--task", help="only this task")
+    add("--data", default="data", help="folder of the demonstrations (default: data)")
+    add("--demonstrations", type=int, default=10, help="demonstrations a task (default: 10)")
+    add("--episodes", type=int, default=20, help="episodes a task (default: 20)")
+    add(
+        "--top", type=int, default=0, help="all checkpoints of a run; also the mean of the best TOP"
     )
-    parser.add_argument("--suite", help="ml10 or ml45 (default: the checkpoint's)")
-    parser.add_argument("--task", help="only this task")
-    parser.add_argument("--data", default="data", help="folder of the demonstrations (default: data)")
-    parser.add_argument("--demonstrations", type=int, default=10, help="demonstrations a task (default: 10)")
-    parser.add_argument("--episodes", type=int, default=20, help="episodes a task (default: 20)")
-    parser.add_argument("--steps", type=int, default=200, help="adaptation steps on novel tasks (default: 200)")
-    parser.add_argument("--top", type=int, default=0, help="all checkpoints of each run; also the mean of the best TOP")
-    parser.add_argument("--seed", type=int, default=0, help="of goals, noise and adaptation (default: 0)")
-    parser.add_argument("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
-    parser.add_argument("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
-    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
-    parser.add_argument("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as in the checkpoint)")
-    parser.add_argument("--gif", metavar="FILE", help="write one rollout of --task as an animation instead")
+    add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
+    add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
+    add("--overwrite", action="store_true", help="replace the report in that folder")
+    add("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
+    add("--workers", type=int, help="processes (default: one a core)")
+    add("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as in the checkpoint)")
+    add("--gif", metavar="FILE", help="write one rollout of --task as an animation instead")
     return parser.parse_args(argv)
 
 
-def main(argv: list[str] | None = None) -> None:
-    from finetune import adapt_checkpoint  # finetune.py imports this module; only the novel tasks need it
-
-    args = parse(argv)
-    for name in ("demonstrations", "episodes", "steps"):
-        if getattr(args, name) < 1:
-            raise InputError(f"--{name} is {getattr(args, name)}: use at least 1")
-    evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after the adaptation
-    if args.gif and not (args.task and args.gif.endswith(".gif")):
-        raise InputError("--gif draws one rollout to a .gif file: name its --task, as in --task reach --gif reach.gif")
-    device = pick_device(args.device)
-    groups = [checkpoints_of(path, args.top) for path in args.checkpoint or [newest_checkpoint()]]
-    labels = {path: f"{path.resolve().parent.name}/{path.stem}" for group in groups for path in group}
-    if len(set(labels.values())) < sum(map(len, groups)):
-        raise InputError("two of the checkpoints have the same folder and file name: rename the folder of one run")
-    policy, info = load_trained(groups[0][-1], device)
-    suite = args.suite or info["suite"]
+def choose_tasks(args: argparse.Namespace, suite: str, info: dict[str, Any]) -> list[str]:
+    """The tasks to measure: --task, the one a policy was adapted to, or those of the split."""
+    adapted = info.get("adapted_to")
+    if args.task and adapted not in (None, args.task):
+        raise ValueError(f"this policy was adapted to {adapted}, not to {args.task}")
+    if args.task or adapted:
+        return [check_task(args.task or adapted)]
+    if suite == "own":
+        raise ValueError("a policy of own recordings has no simulator to be measured in")
     base, novel = suite_tasks(suite)
-    chosen = {"base": base, "novel": novel, "all": base + novel}[args.split]
-    if args.task:
-        chosen = [check_task(args.task)]
+    return {"base": base, "novel": novel, "all": base + novel}[args.split]
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = parse(argv)
+    for name in ("demonstrations", "episodes"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name} is {getattr(args, name)}: use at least 1")
+    evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after collecting
+    if args.gif and not (args.task and args.gif.endswith(".gif")):
+        raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
+    device = pick_device(args.device)
+
+    # Which checkpoints: of each run the last, or all of them for the mean of the best
+    runs = [
+        checkpoints_of(path)
+        for path in args.checkpoint or [default_checkpoint(args.suite or "ml10")]
+    ]
+    for found in runs:
+        if args.top > len(found):
+            raise ValueError(f"{found[-1].parent} holds {len(found)} checkpoints, fewer than --top")
+    runs = [found if args.top else found[-1:] for found in runs]
+    labels = {path: f"{path.resolve().parent.name}/{path.stem}" for run in runs for path in run}
+    if len(set(labels.values())) < sum(map(len, runs)):
+        raise ValueError("two checkpoints have the same folder and file name: rename one's folder")
+    policy, info = load_checkpoint(runs[0][-1], device, needs=TRAINED)
+
+    # Tasks, their demonstrations and instructions
+    suite = args.suite or info["suite"]
+    tasks = choose_tasks(args, suite, info)
     out = Path(args.out)
-    out.mkdir(parents=True, exist_ok=True)
-    paths = collect(chosen, args.data, args.demonstrations, workers=args.workers)
-    demonstrations = {task: load_demonstrations(path).first(args.demonstrations) for task, path in paths.items()}
-    instructions = [demonstrations[task].instruction for task in chosen]
+    if not args.gif:
+        claim_folder(out, "success.json", args.overwrite)
+    paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
+    recorded = {task: load_demonstrations(paths[task]).take(args.demonstrations) for task in tasks}
+    instructions = [recorded[task].instruction for task in tasks]
     features, identity = text_features(instructions, args.clip_weights, info["text_weights"])
-    text = dict(zip(chosen, features.to(device)))
+    text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
 
     if args.gif:
-        sampler = window_sampler(policy, demonstrations[args.task])
+        sampler = WindowSampler(recorded[args.task], policy.config, device)
         success = write_gif(policy, sampler, text[args.task], args.seed, args.gif)
         print(f"{args.task}: {'success' if success else 'failure'}; wrote {args.gif}")
         return
 
-    def measure(checkpoint: Path) -> Successes:
-        _, info = load_trained(checkpoint)
+    results = {}
+    for checkpoint in labels:
+        _, info = load_checkpoint(checkpoint, needs=TRAINED)
         if info["text_weights"] != identity:
-            raise InputError(f"{checkpoint} was made with the text weights {info['text_weights']!r}, not {identity!r}")
-        settings = (args.episodes, args.seed, args.workers, device, args.demonstrations)
-        direct = [task for task in chosen if task not in novel or "adapted_to" in info]
-        successes = evaluate(checkpoint, {task: paths[task] for task in direct}, text, *settings) if direct else {}
-        for task in chosen:
-            if task not in direct:  # a novel task: adapt first
-                adapted = out / f"{labels[checkpoint].replace('/', '-')}-{task}.pt"
-                adapt_checkpoint(checkpoint, demonstrations[task], text[task], adapted, args.steps, seed=args.seed)
-                successes |= evaluate(adapted, {task: paths[task]}, text, *settings)
-        return successes
+            raise ValueError(f"{checkpoint} was made with text weights {info['text_weights']!r}")
+        protocol = (args.episodes, args.seed, args.workers, device, args.demonstrations)
+        results[checkpoint] = evaluate(checkpoint, paths, text, *protocol)
 
-    results = {checkpoint: measure(checkpoint) for checkpoints in groups for checkpoint in checkpoints}
-    columns = {labels[group[-1]]: results[group[-1]] for group in groups}
-    facts = {
-        "title": f"{suite}, {args.split} tasks" if not args.task else args.task,
-        "episodes a task": args.episodes,
-        "seed": args.seed,
-        "adaptation steps": args.steps,
-        "hardware": hardware(device),
-        "text weights": identity,
-        "date": time.strftime("%Y-%m-%d"),
-        "command": command("evaluate.py", argv),
-    }
-    for name, split in {"base": base, "novel": novel}.items():
-        inside = [task for task in chosen if task in split]
-        if inside and len(chosen) > 1:
-            means = [[mean_success({t: results[c][t] for t in inside}) for c in group] for group in groups]
-            facts[f"{name} mean, last checkpoint"] = mean_interval([group[-1] for group in means])
-            if args.top:
-                best = [float(np.mean(sorted(group)[-args.top :])) for group in means]
-                facts[f"{name} mean, best {args.top} checkpoints"] = mean_interval(best)
-    every = {labels[checkpoint]: successes for checkpoint, successes in results.items()} if args.top else None
-    print(f"\n{write_report(out, columns, facts, suite, every)}\n")
+    facts = {"title": tasks[0] if len(tasks) == 1 else f"{suite}, {args.split} tasks"}
+    facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
+    facts |= report_facts("evaluate.py", argv, device)
+    means = [[mean_success(results[checkpoint]) for checkpoint in run] for run in runs]
+    facts["mean, last checkpoint"] = mean_interval([run[-1] for run in means])
+    if args.top:
+        best = [float(np.mean(sorted(run)[-args.top :])) for run in means]
+        facts[f"mean, best {args.top} checkpoints"] = mean_interval(best)
+    columns = {labels[run[-1]]: results[run[-1]] for run in runs}
+    all_checkpoints = {labels[path]: found for path, found in results.items()} if args.top else None
+    print(f"\n{write_report(out, columns, facts, suite, all_checkpoints)}\n")
     for name, value in facts.items():
         print(f"{name}: {value}")
 
 
 if __name__ == "__main__":
-    command_line(main, ModelInputError)
+    command_line(main)

@@ -1,11 +1,13 @@
 """Few-shot adaptation to a novel task (Algorithm 2): ten demonstrations, 200 gradient steps.
 
-    python finetune.py --task shelf-place                        # from the newest run's last checkpoint
-    python finetune.py --data demos.npz --steps 500              # own demonstrations, in the format of data.py
+    python finetune.py --task shelf-place            # from the newest run, or the policy that ships
+    python finetune.py --task novel                  # all novel tasks of the suite
+    python finetune.py --data demos.npz --steps 500  # own demonstrations, in data.py's format
 
-The EMA policy of meta-training is copied and trained with AdamW on windows of the task's demonstrations, each step with
-a reference demonstration drawn from them; the three parts of the policy have learning rates of their own. An EMA of the
-adapted policy is what is kept. On a Meta-World task it is then rolled out, and so is the policy before adaptation: the
+The EMA policy of meta-training is copied and trained with AdamW on windows of the task's
+demonstrations, each step with a reference demonstration drawn from them; the three parts of the
+policy have learning rates of their own. An EMA of the adapted policy is what is kept. There is no
+warm-up and no decay. On a Meta-World task the policy is then rolled out, before and after: the
 difference is what adaptation bought.
 """
 
@@ -14,6 +16,7 @@ import copy
 import json
 import time
 from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,37 +24,33 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from data import (
-    INSTRUCTIONS,
-    Demonstrations,
-    InputError,
-    WindowSampler,
-    check_task,
-    collect,
-    command_line,
-    evaluation_seed,
-    load_demonstrations,
-)
-from evaluate import (
-    command,
-    evaluate,
-    hardware,
-    load_trained,
-    newest_checkpoint,
-    pick_device,
-    text_features,
-    window_sampler,
-    write_atomically,
-    write_report,
-)
-from model import DAMIPolicy, ema_model, save_checkpoint
-from model import InputError as ModelInputError
+import evaluate
+from clip import text_features
+from data import Flags, WindowSampler, command_line, load_demonstrations, setting
+from model import DAMIPolicy, ema_model, load_checkpoint, save_checkpoint
+from simulator import INSTRUCTIONS, check_task, collect, suite_tasks
 
-# AdamW's learning rates for the parts of the policy. The paper's belong to a meta-training at 1e-4; those of the other
-# presets keep their proportion to the learning rate the policy was meta-trained with.
-LEARNING_RATES = {"vision": 1e-5, "diffusion": 3e-5, "other": 1e-4}
-PAPER_LEARNING_RATE = 1e-4
+LEARNING_RATES = {"vision": 1e-5, "diffusion": 3e-5, "other": 1e-4}  # AdamW's, by part
+PAPER_LEARNING_RATE = 1e-4  # of the meta-training that they belong to
 BATCH = {"paper": 108, "small": 64, "tiny": 16}  # windows a step
+
+
+@dataclass(frozen=True)
+class Settings(Flags):
+    """What an adaptation is made of; each field is a flag. None: as the preset has it."""
+
+    steps: int = setting(200, "gradient steps (default: 200)", least=1)
+    batch: int | None = setting(None, "windows a step (default: the preset's)", least=1)
+    lr_vision: float | None = setting(None, "learning rate of the observation encoder", least=0)
+    lr_diffusion: float | None = setting(None, "learning rate of the U-Net", least=0)
+    lr_other: float | None = setting(None, "learning rate of VMT and U2T", least=0)
+    normalizer: str = setting("fit", "to the task, or `keep` the suite's", choices=("fit", "keep"))
+    demonstrations: int | None = setting(None, "how many (default: 10; of a file all)", least=1)
+    episodes: int = setting(20, "rollouts before and after (default: 20)", least=0)
+    seed: int = setting(0, "of batches, noise and goals (default: 0)", least=0, most=999)
+
+
+# ---- Algorithm 2 ---------------------------------------------------------------------------------
 
 
 def adapt_policy(
@@ -61,22 +60,17 @@ def adapt_policy(
     steps: int = 200,
     batch: int = 108,
     learning_rates: dict[str, float] = LEARNING_RATES,
-    clip: float = 1.0,
-    weight_decay: float = 1e-6,
     seed: int = 0,
     on_step: Callable[[int, float], None] | None = None,
 ) -> DAMIPolicy:
-    """Adapts a copy of a policy to the demonstrations of one task (Algorithm 2, lines 2-16).
+    """Adapts a copy of a policy to the demonstrations of one task (Algorithm 2, lines 2 to 17).
 
     Args:
         policy: the meta-trained (EMA) policy; it is left as it is.
-        sampler: of the task's demonstrations, on the policy's device (`evaluate.window_sampler`).
+        sampler: of the task's demonstrations, on the policy's device.
         text: instruction feature, (text_dim,).
-        steps: gradient steps.
-        batch: windows a step.
+        steps, batch: gradient steps, and windows in each.
         learning_rates: of the parameter groups `vision`, `diffusion` and `other`.
-        clip: largest norm of the gradient.
-        weight_decay: of AdamW.
         seed: of batches, demonstrations and noise.
         on_step: called with (steps done, loss) after each.
 
@@ -84,73 +78,63 @@ def adapt_policy(
         The moving average of the adapted policy, in evaluation mode.
 
     Raises:
-        InputError: the loss is not finite.
+        ValueError: the loss is not finite.
     """
-    adapted = copy.deepcopy(policy).train()
+    adapted = copy.deepcopy(policy).train()  # line 2
     average = ema_model(adapted)
-    groups = adapted.parameter_groups()
-    optimizer = torch.optim.AdamW(
-        [{"params": groups[name], "lr": lr} for name, lr in learning_rates.items() if groups[name]],
-        betas=(0.95, 0.999),
-        weight_decay=weight_decay,
-        fused=True,
-    )
+    parts = adapted.parameter_groups()
+    groups = [
+        {"params": parts[name], "lr": lr} for name, lr in learning_rates.items() if parts[name]
+    ]
+    optimizer = torch.optim.AdamW(groups, betas=(0.95, 0.999), weight_decay=1e-6, fused=True)
     generator = torch.Generator().manual_seed(seed)
-    for step in range(steps):
-        loss = adapted.loss(text=text[None], **sampler.batch(batch, generator), **adapted.draw_noise(batch, generator))
+
+    for step in range(1, steps + 1):  # line 6
+        windows = sampler.batch(batch, generator)  # line 7
+        noise = adapted.draw_noise_and_timesteps(batch, generator)  # line 10
+        loss = adapted.loss(text=text[None], **windows, **noise)  # lines 8 to 14
         if not torch.isfinite(loss):
-            raise InputError(f"the loss is not finite at step {step + 1} on {sampler.task}: use smaller learning rates")
+            task = sampler.task
+            raise ValueError(f"the loss is not finite at step {step} on {task}: lower the --lr-...")
+
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(adapted.parameters(), clip)
-        optimizer.step()
-        average.update_parameters(adapted)
+        torch.nn.utils.clip_grad_norm_(adapted.parameters(), 1.0)
+        optimizer.step()  # line 15
+        average.update_parameters(adapted)  # line 16
         if on_step is not None:
-            on_step(step + 1, loss.item())
+            on_step(step, loss.item())
     return average.module.eval()
 
 
+# ---- From files to files -------------------------------------------------------------------------
+
+
 def adapt_checkpoint(
-    checkpoint: str | Path,
-    demonstrations: Demonstrations,
-    text: Tensor,
-    out: str | Path,
-    steps: int = 200,
-    batch: int | None = None,
-    learning_rates: dict[str, float] | None = None,
-    normalizer: str = "fit",
-    seed: int = 0,
+    checkpoint: Path, data: Path, text: Tensor, folder: Path, settings: Settings
 ) -> dict[str, Any]:
-    """Adapts the policy of a checkpoint to a task and writes the adapted one to `out`, a checkpoint like any other.
+    """Adapts the policy of a checkpoint to the task of a recording, on the device of `text`.
 
-    Args:
-        checkpoint: a file of train.py.
-        demonstrations: of the task.
-        text: instruction feature, (text_dim,), on the device to adapt on.
-        steps, seed: as in `adapt_policy`.
-        batch: windows a step; None: the preset's.
-        learning_rates: changes to the default ones, by parameter group.
-        normalizer: `fit` the value ranges to the demonstrations (Algorithm 2, line 3), or `keep` those of the suite.
-
-    Returns:
-        The settings used, `seconds` spent on the steps, and `losses`, one a step.
-
-    Raises:
-        InputError: checkpoint and demonstrations do not fit each other, or the loss is not finite.
+    Writes adapted.pt (a checkpoint like any other), metrics.jsonl and config.json to `folder`, and
+    returns what config.json says: the settings used, with the preset's in place of None, and
+    `seconds` spent on the steps. Raises ValueError where the two files do not fit each other.
     """
-    policy, info = load_trained(checkpoint, text.device)
-    sampler = window_sampler(policy, demonstrations, info["arguments"].get("after_success"))
-    if normalizer == "fit":
-        policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
-    scale = info["arguments"]["lr"] / PAPER_LEARNING_RATE
-    settings = {
-        "steps": steps,
-        "batch": batch or BATCH[info["preset"]],
-        "learning_rates": {name: lr * scale for name, lr in LEARNING_RATES.items()} | (learning_rates or {}),
-        "seed": seed,
-    }
+    policy, info = load_checkpoint(checkpoint, text.device, needs=evaluate.TRAINED)
+    demonstrations = load_demonstrations(data).take(settings.demonstrations)
+    trained, device = info["arguments"], text.device
+    sampler = WindowSampler(demonstrations, policy.config, device, trained.get("after_success"))
+    if settings.normalizer == "fit":
+        policy.normalizer.fit(sampler.points, sampler.state, sampler.action)  # line 3
+
+    # The paper's rates belong to a meta-training at 1e-4; for another they keep their proportion.
+    scale = trained["lr"] / PAPER_LEARNING_RATE
+    given = {part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES}
+    rates = {p: lr * scale if given[p] is None else given[p] for p, lr in LEARNING_RATES.items()}
+    batch = settings.batch or BATCH[info["preset"]]
+
     losses = []
-    with tqdm(total=steps, desc=f"adapting to {demonstrations.task}", unit="step", dynamic_ncols=True) as progress:
+    bar = {"desc": f"adapting to {demonstrations.task}", "unit": "step", "dynamic_ncols": True}
+    with tqdm(total=settings.steps, **bar) as progress:
 
         def on_step(step: int, loss: float) -> None:
             losses.append(loss)
@@ -158,102 +142,97 @@ def adapt_checkpoint(
             progress.update()
 
         began = time.monotonic()
-        adapted = adapt_policy(policy, sampler, text, **settings, on_step=on_step)
+        steps, seed = settings.steps, settings.seed
+        adapted = adapt_policy(policy, sampler, text, steps, batch, rates, seed, on_step)
         seconds = time.monotonic() - began
-    settings["normalizer"] = normalizer
-    kept = {name: info[name] for name in ("suite", "preset", "text_weights", "arguments", "step")}
-    about = {"adapted_to": demonstrations.task, "instruction": demonstrations.instruction, "adaptation": settings}
-    save_checkpoint(out, adapted, **kept, **about)
-    return {**settings, "seconds": seconds, "losses": losses}
+
+    used = asdict(settings) | {"batch": batch, "learning_rates": rates}
+    kept = {name: info[name] for name in evaluate.TRAINED}
+    about = {"adapted_to": demonstrations.task, "instruction": demonstrations.instruction}
+    save_checkpoint(folder / "adapted.pt", adapted, **kept, **about, adaptation=used)
+    evaluate.rewind_metrics(folder, 0)
+    for step, loss in enumerate(losses, start=1):
+        evaluate.log(folder, step=step, loss=loss)
+    written = {"checkpoint": str(checkpoint), "data": str(data), **used, "seconds": seconds}
+    evaluate.write_text(folder / "config.json", json.dumps(written, indent=1))
+    return written
+
+
+# ---- Command line --------------------------------------------------------------------------------
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Adapt a meta-trained policy to one task (Algorithm 2).")
-    parser.add_argument("--task", help="a Meta-World task; its demonstrations are collected if missing")
-    parser.add_argument("--data", default="data", help="folder of the demonstrations, or one file (default: data)")
-    parser.add_argument("--checkpoint", help="policy to start from (default: the newest run's last)")
-    parser.add_argument(
-        "--out", help="folder for the adapted policy and its report (default: runs/finetune/TASK-seedSEED)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of batches, noise and evaluation (default: 0)")
-    parser.add_argument("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
-    parser.add_argument(
-        "--episodes", type=int, default=20, help="evaluation episodes; 0: do not evaluate (default: 20)"
-    )
-    parser.add_argument("--workers", type=int, help="processes for collecting and evaluating (default: one a core)")
-    parser.add_argument("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as in the checkpoint)")
-    parser.add_argument("--demonstrations", type=int, help="the first so many (default: 10, or all of a file's)")
-    parser.add_argument("--steps", type=int, default=200, help="gradient steps (default: 200)")
-    parser.add_argument("--batch", type=int, help="windows a step (default: paper 108, small 64, tiny 16)")
-    parser.add_argument(
-        "--normalizer",
-        choices=("fit", "keep"),
-        default="fit",
-        help="value ranges: the task's (default), or the suite's",
-    )
-    for part in LEARNING_RATES:
-        parser.add_argument(f"--lr-{part}", type=float, help=f"learning rate of the {part} parameters")
+    parser = argparse.ArgumentParser(description="Adapts a policy to one task (Algorithm 2).")
+    add = parser.add_argument_group("run").add_argument
+    add("--task", help="a Meta-World task, or `novel`: all novel tasks of the suite")
+    add("--suite", default="ml10", help="of the run to start from, and of `novel` (default: ml10)")
+    add("--data", default="data", help="folder of the demonstrations, or one file (default: data)")
+    add("--checkpoint", help="file or run folder to start from (default: the newest run's last)")
+    add("--out", help="folder of the adapted policy (default: runs/finetune/TASK-seedSEED)")
+    add("--overwrite", action="store_true", help="replace what is in that folder")
+    add("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
+    add("--workers", type=int, help="processes for collecting and evaluating (default: one a core)")
+    add("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as in the checkpoint)")
+    Settings.add_flags(parser.add_argument_group("settings"))
     return parser.parse_args(argv)
 
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    for name in ("steps", "batch", "demonstrations"):
-        if (value := getattr(args, name)) is not None and value < 1:
-            raise InputError(f"--{name} is {value}: use at least 1")
-    evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after the adaptation
-    device = pick_device(args.device)
-    data = Path(args.data)
-    if args.task is None and data.suffix != ".npz":
-        raise InputError("name a Meta-World task with --task, or a file of demonstrations with --data")
-    if args.task is not None:
-        check_task(args.task)
-    checkpoint = Path(args.checkpoint) if args.checkpoint else newest_checkpoint()
-    _, info = load_trained(checkpoint)
-    print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {device} ({hardware(device)})", flush=True)
+    settings = Settings().given(args)
+    device = evaluate.pick_device(args.device)
 
-    n_demonstrations = args.demonstrations
-    if data.suffix != ".npz":
-        n_demonstrations = n_demonstrations or 10
-        data = collect([args.task], data, n_demonstrations, workers=args.workers)[args.task]
-    demonstrations = load_demonstrations(data).first(n_demonstrations)
-    task = args.task or demonstrations.task
-    features, identity = text_features([demonstrations.instruction], args.clip_weights, info["text_weights"])
-    text = features[0].to(device)
-    folder = Path(args.out or f"runs/finetune/{task}-seed{args.seed}")
-    folder.mkdir(parents=True, exist_ok=True)
+    # Which tasks, from which policy: a recording of one's own, one task, or all novel tasks
+    file = Path(args.data) if args.data.endswith(".npz") else None
+    if args.task is None and file is None:
+        raise ValueError("name a task of Meta-World with --task, or a recording with --data")
+    if file is not None:
+        tasks = [args.task or load_demonstrations(file).task]
+    else:
+        tasks = suite_tasks(args.suite)[1] if args.task == "novel" else [check_task(args.task)]
+    simulated = all(task in INSTRUCTIONS for task in tasks)
+    start = args.checkpoint or evaluate.default_checkpoint(args.suite if simulated else "own")
+    checkpoint = evaluate.checkpoints_of(start)[-1]
+    _, info = load_checkpoint(checkpoint, needs=evaluate.TRAINED)
+    where = f"{device} ({evaluate.hardware(device)})"
+    print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {where}", flush=True)
 
-    given = {name: lr for name in LEARNING_RATES if (lr := getattr(args, f"lr_{name}")) is not None}
-    adapted = folder / "adapted.pt"
-    result = adapt_checkpoint(
-        checkpoint, demonstrations, text, adapted, args.steps, args.batch, given, args.normalizer, args.seed
-    )
-    losses, seconds = result.pop("losses"), result["seconds"]
-    lines = "".join(json.dumps({"step": step, "loss": loss}) + "\n" for step, loss in enumerate(losses, start=1))
-    write_atomically(folder / "metrics.jsonl", lambda temporary: temporary.write_text(lines))
-    written = {"checkpoint": str(checkpoint), "data": str(data), **result, "text_weights": identity}
-    write_atomically(folder / "config.json", lambda temporary: temporary.write_text(json.dumps(written, indent=1)))
-    print(f"adapted in {seconds:.1f} s: loss {losses[0]:.4f} -> {losses[-1]:.4f}; wrote {adapted}", flush=True)
+    # Folders, demonstrations and instructions
+    folder = Path(args.out or f"runs/finetune/{args.task or tasks[0]}-seed{settings.seed}")
+    folders = {task: folder / task if args.task == "novel" else folder for task in tasks}
+    for path in folders.values():
+        evaluate.claim_folder(path, "adapted.pt", args.overwrite)
+    if file is None:
+        settings = replace(settings, demonstrations=settings.demonstrations or 10)
+        paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
+    else:
+        paths = {tasks[0]: file}
+    instructions = [load_demonstrations(paths[task]).instruction for task in tasks]
+    features, identity = text_features(instructions, args.clip_weights, info["text_weights"])
+    text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
 
-    if args.episodes == 0 or task not in INSTRUCTIONS:  # own recordings have no simulator to be rolled out in
-        return
-    columns = {
-        name: evaluate(
-            path, {task: data}, {task: text}, args.episodes, args.seed, args.workers, device, args.demonstrations
-        )
-        for name, path in {"before": checkpoint, "after": adapted}.items()
-    }
-    facts = {
-        "title": f"{task}: before and after {args.steps} steps",
-        "checkpoint": str(checkpoint),
-        "adaptation": f"{args.steps} steps in {seconds:.1f} s on {hardware(device)}",
-        "seed": args.seed,
-        "text weights": identity,
-        "date": time.strftime("%Y-%m-%d"),
-        "command": command("finetune.py", argv),
-    }
-    print(f"\n{write_report(folder, columns, facts, info['suite'])}")
+    columns, seconds = {"before": {}, "after": {}}, 0.0
+    for task in tasks:
+        adapted = folders[task] / "adapted.pt"
+        used = adapt_checkpoint(checkpoint, paths[task], text[task], folders[task], settings)
+        seconds += used["seconds"]
+        print(f"adapted to {task} in {used['seconds']:.1f} s; wrote {adapted}", flush=True)
+        if simulated and settings.episodes:
+            protocol = (settings.episodes, settings.seed, args.workers, device)
+            for column, policy in {"before": checkpoint, "after": adapted}.items():
+                columns[column] |= evaluate.evaluate(
+                    policy, {task: paths[task]}, text, *protocol, settings.demonstrations
+                )
+    if not columns["after"]:
+        return  # own recordings have no simulator to be rolled out in
+
+    facts = {"title": f"{args.task}: before and after {settings.steps} steps"}
+    facts |= {"checkpoint": str(checkpoint), "seconds a task": round(seconds / len(tasks), 1)}
+    facts |= {name: getattr(settings, name) for name in ("steps", "demonstrations", "episodes")}
+    facts |= {"seed": settings.seed, "text weights": identity}
+    facts |= evaluate.report_facts("finetune.py", argv, device)
+    print(f"\n{evaluate.write_report(folder, columns, facts, info['suite'])}")
 
 
 if __name__ == "__main__":
-    command_line(main, ModelInputError)
+    command_line(main)

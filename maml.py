@@ -1,17 +1,18 @@
-"""Model-agnostic meta-learning (MAML) with second-order gradients, for any loss.
+"""Model-agnostic meta-learning, with the exact second-order gradient, for any model and any loss.
 
     inner loop    theta'_i = theta - alpha * grad_theta L(theta, support_i)               (Eq. 2)
     outer loop    g = grad_theta 1/|tasks| * sum_i L(theta'_i(theta), query_i)            (Eq. 3)
 
-The outer gradient runs *through* the inner step: theta'_i depends on theta twice, once directly and once through the
-support gradient, so g contains the second derivatives of the support loss. `torch.func.grad` gives this by
-construction, because a gradient is a function like any other and can be differentiated again.
+The outer gradient runs *through* the inner step: theta'_i depends on theta twice, once directly and
+once through the support gradient, so g contains the second derivatives of the support loss.
+`torch.func.grad` gives this by construction, because a gradient is a function like any other and
+can be differentiated again.
 
-Nothing here knows what a policy is. A model enters as `params`, a dictionary of tensors, and a function
-`loss_fn(params, batch) -> scalar tensor`; with a `torch.nn.Module` that is
+Nothing here knows what a policy is. A model enters as `params`, a dictionary of tensors, and a
+function `loss_fn(params, batch) -> scalar tensor`; with a `torch.nn.Module` that is
 
-    def loss_fn(params, batch):
-        return torch.func.functional_call(module, params, (), batch)      # batch: keyword arguments of module.forward
+    def loss_fn(params, batch):  # batch: keyword arguments of module.forward
+        return torch.func.functional_call(module, params, (), batch)
 
 `loss_fn` must be pure: random numbers (diffusion noise, dropout masks) belong in `batch`.
 """
@@ -22,34 +23,33 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import grad, grad_and_value, vmap
+from torch.func import grad, grad_and_value
 from torch.utils._pytree import tree_map
 
 Params = dict[str, Tensor]
 LossFn = Callable[[Params, Any], Tensor]
 
 
-def adapt(loss_fn: LossFn, params: Params, batch: Any, lr: float, steps: int = 1, first_order: bool = False) -> Params:
-    """Takes `steps` steps of gradient descent on one batch and returns the adapted parameters (Eq. 2).
+def adapt(
+    loss_fn: LossFn, params: Params, batch: Any, lr: float, steps: int = 1, first_order=False
+) -> Params:
+    """Returns the parameters after `steps` steps of gradient descent on one batch (Eq. 2).
 
     The result is a differentiable function of `params`; the input is not modified.
 
     Args:
         loss_fn: `(params, batch) -> ()`, pure.
-        params: name -> tensor, the initialisation theta.
+        params: name -> tensor, theta.
         batch: anything `loss_fn` understands, usually the support set of a task.
         lr: the inner learning rate alpha.
         steps: gradient steps, all on the same batch.
-        first_order: treat the inner gradient as a constant, so that who differentiates the result sees
-            d theta' / d theta = 1. Cheaper, and a different gradient.
-
-    Returns:
-        name -> tensor, theta'.
+        first_order: the inner gradient counts as a constant, so that who differentiates the result
+            sees d theta' / d theta = 1. Cheaper, and a different gradient.
     """
     for _ in range(steps):
         start = {name: p.detach() for name, p in params.items()} if first_order else params
         gradient = grad(loss_fn)(start, batch)
-        # p - lr * gradient, in one pass over the memory instead of two, and again in its derivative.   Eq. 2
+        # p - lr * gradient, in one pass over the memory instead of two, as in its derivative.
         params = {name: torch.add(p, gradient[name], alpha=-lr) for name, p in params.items()}
     return params
 
@@ -63,46 +63,48 @@ def meta_gradient(
     first_order: bool = False,
     vectorize: int = 1,
 ) -> tuple[Params, Tensor]:
-    """Mean query loss over tasks, differentiated through each task's inner loop (Eq. 3; Algorithm 1, lines 4-19).
+    """The gradient of the mean query loss, through each task's inner loop (Eq. 3; Algorithm 1).
 
     Args:
-        loss_fn: `(params, batch) -> ()`, pure.
-        params: name -> tensor, the initialisation theta.
-        tasks: (support, query) batches, one pair a task. An iterator is read `vectorize` tasks at a time, and their
-            graph is freed before the next are read: memory does not grow with the number of tasks.
-        lr, steps, first_order: as in `adapt`.
-        vectorize: so many tasks run at once, under `torch.vmap`: the same numbers, up to twice as fast, with memory for
-            all of these. Their batches must have equal shapes and hold tensors only.
+        loss_fn, params, lr, steps, first_order: as in `adapt`.
+        tasks: (support, query) batches, one pair a task. An iterator is read `vectorize` tasks at a
+            time, and their graph is freed before the next are read: memory does not grow with the
+            number of tasks.
+        vectorize: so many tasks run at once, under `torch.vmap`: the same numbers, up to twice as
+            fast, with memory for all of these. Their batches must have equal shapes and hold
+            tensors only.
 
     Returns:
-        (gradients, losses): name -> tensor, and the query losses after adaptation, (tasks,), detached.
+        (gradients, losses): name -> tensor, and the query losses after adaptation (tasks,).
 
     Raises:
         ValueError: `tasks` is empty, or `vectorize` is less than 1.
     """
     if vectorize < 1:
         raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
-    # Parameters that require grad would make autograd record all of this once more, beneath torch.func.
+    # If they required grad, autograd would record all of this once more, beneath torch.func.
     params = {name: p.detach() for name, p in params.items()}
 
     def query_loss(params: Params, support: Any, query: Any) -> Tensor:
-        adapted = adapt(loss_fn, params, support, lr, steps, first_order)
-        return loss_fn(adapted, query)
+        return loss_fn(adapt(loss_fn, params, support, lr, steps, first_order), query)
 
-    def summed_query_loss(params: Params, tasks: list[tuple[Any, Any]]) -> tuple[Tensor, Tensor]:
-        if len(tasks) == 1:
-            losses = query_loss(params, *tasks[0])[None]  # (1,)
+    def summed_query_loss(params: Params, chunk: list) -> tuple[Tensor, Tensor]:
+        if len(chunk) == 1:
+            losses = query_loss(params, *chunk[0])[None]
         else:
-            support, query = tree_map(lambda *leaves: torch.stack(leaves), *tasks)
-            losses = vmap(query_loss, in_dims=(None, 0, 0))(params, support, query)  # (tasks,)
+            support, query = tree_map(lambda *parts: torch.stack(parts), *chunk)
+            losses = torch.vmap(query_loss, in_dims=(None, 0, 0))(params, support, query)
         return losses.sum(), losses
 
     tasks, total, losses = iter(tasks), None, []
     while chunk := list(islice(tasks, vectorize)):
-        gradients, (_, chunk_losses) = grad_and_value(summed_query_loss, has_aux=True)(params, chunk)
-        total = gradients if total is None else {name: total[name].add_(g) for name, g in gradients.items()}
-        losses.append(chunk_losses.detach())
+        gradients, (_, of_chunk) = grad_and_value(summed_query_loss, has_aux=True)(params, chunk)
+        losses.append(of_chunk.detach())
+        if total is None:
+            total = gradients
+        else:
+            total = {name: total[name].add_(g) for name, g in gradients.items()}
     if total is None:
         raise ValueError("meta_gradient needs at least one task")
-    losses = torch.cat(losses)  # (tasks,)
+    losses = torch.cat(losses)
     return {name: g / len(losses) for name, g in total.items()}, losses

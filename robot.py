@@ -1,20 +1,24 @@
-"""A UR10e with an AG95 gripper and a RealSense camera: record demonstrations, run the adapted policy.
+"""A UR10e with an AG95 gripper and a RealSense camera: record demonstrations, run a policy.
 
-    python robot.py check  --host 192.168.1.10 --config robot.json        # every connection, mode and camera; read only
-    python robot.py record --host 192.168.1.10 --config robot.json --task stack-cube --instruction "..." --episodes 10
-    python robot.py run    --host 192.168.1.10 --config robot.json --checkpoint adapted.pt --data demos/stack-cube.npz
+    python robot.py check  --config robot.json     # every connection, mode and camera; read only
+    python robot.py record --config robot.json --task stack-cube --instruction "..." --episodes 10
+    python robot.py run    --config robot.json --checkpoint adapted.pt --data demos/stack-cube.npz
 
-Without an arm: `python -m tests.emulator` and --host 127.0.0.1. With --dry-run nothing is made to move.
+Each with --host ADDRESS. Without an arm: `python -m tests.emulator` and --host 127.0.0.1. With
+--dry-run nothing is made to move.
 
-One action, from the network to the arm: `run` draws a chunk with `DAMIPolicy.sample_actions`, `Servo.follow` turns it
-into target poses, `Servo.tick` interpolates to 125 Hz and clamps, `RTDE.send` packs the bytes. On the controller a
-URScript program (`SERVO_PROGRAM`) reads the pose from registers, solves the inverse kinematics and calls servoj.
+One action, from the network to the arm: `run` draws a chunk with `DAMIPolicy.sample_actions`,
+`Servo.follow` turns it into target poses, `Servo.tick` interpolates to 125 Hz and clamps,
+`RTDE.send` packs the bytes. On the controller a URScript program (`SERVO_PROGRAM`) reads the pose
+from registers, solves the inverse kinematics and calls servoj.
 
-Poses are (x, y, z, rx, ry, rz): metres and axis-angle radians of the tool center point (TCP) in the robot's base frame.
-State (7,): TCP pose, gripper. Action (7,): dx, dy, dz in metres, drx, dry, drz in radians (a rotation in the base frame,
-applied after the present one), gripper; relative to the pose commanded last. Gripper: 0 open, 1 closed.
+Poses are (x, y, z, rx, ry, rz): metres and axis-angle radians of the tool center point (TCP) in the
+robot's base frame. State (7,): TCP pose, gripper. Action (7,): dx, dy, dz in metres, drx, dry, drz
+in radians (a rotation in the base frame, applied after the present one), gripper; relative to the
+pose commanded last. Gripper: 0 open, 1 closed.
 
-What stops the arm, and how it is stopped, is in `Servo`. Nothing here unlocks a stop or connects again by itself.
+What stops the arm, and how it is stopped, is in `Servo`. Nothing here unlocks a stop or connects
+again by itself.
 """
 
 from __future__ import annotations
@@ -41,34 +45,37 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation  # scipy comes with metaworld
 
+from clip import text_features
 from data import (
     Demonstrations,
-    InputError,
+    WindowSampler,
     command_line,
     farthest_point_sample,
     load_demonstrations,
     save_demonstrations,
 )
-from evaluate import load_trained, text_features, window_sampler
-from model import InputError as ModelInputError
+from model import load_checkpoint
 
 STATE_DIM = ACTION_DIM = 7
 
 
-class RobotError(InputError):
+class RobotError(Exception):
     """Arm, gripper or camera cannot go on; the message says why. The arm has been stopped."""
 
 
 class CameraError(RobotError):
-    """The camera gives no usable cloud. While the policy runs the arm is held, and stopped after `max_hold_s`."""
+    """The camera gives no usable cloud. While the policy runs the arm is held, and stopped after
+    `max_hold_s`.
+    """
 
 
-# ---- Settings --------------------------------------------------------------------------------------------------------
+# ---- Settings ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the JSON file of --config holds. Lengths are in metres, angles in radians, frames the robot's base.
+    """What the JSON file of --config holds. Lengths are in metres, angles in radians, frames the
+    robot's base.
 
     The first five have no default: they belong to the place where the arm stands.
     """
@@ -77,9 +84,15 @@ class Settings:
     tcp_high_m: tuple[float, ...]  # (3,)
     crop_low_m: tuple[float, ...]  # (3,) the box that points of the cloud are kept in
     crop_high_m: tuple[float, ...]  # (3,)
-    camera_to_base: tuple[tuple[float, ...], ...]  # (4, 4) pose of the camera, rotation and translation in metres
+    camera_to_base: tuple[
+        tuple[float, ...], ...
+    ]  # (4, 4) pose of the camera, rotation and translation in metres
     outside_box: str = "stop"  # or "clamp": what happens to a target outside the box
-    rotation_near_rad: tuple[float, ...] = (0.0, 3.14159, 0.0)  # (3,) of a state's two rotation vectors, the nearer one
+    rotation_near_rad: tuple[float, ...] = (
+        0.0,
+        3.14159,
+        0.0,
+    )  # (3,) of a state's two rotation vectors, the nearer one
     num_points: int = 1024
     policy_hz: float = 10.0  # observations and actions a second
     servo_hz: float = 125.0
@@ -91,7 +104,9 @@ class Settings:
     max_hold_s: float = 2.0  # how long the arm waits in place for a late policy or camera
     servo_lookahead_s: float = 0.1
     servo_gain: float = 300.0
-    gripper_serial: str | None = None  # such as "/dev/ttyUSB0"; null: over TCP, at gripper_port of --host
+    gripper_serial: str | None = (
+        None  # such as "/dev/ttyUSB0"; null: over TCP, at gripper_port of --host
+    )
     gripper_force_percent: int = 30
     rtde_port: int = 30004
     script_port: int = 30002
@@ -100,12 +115,15 @@ class Settings:
 
     def __post_init__(self) -> None:
         def refuse(name: str, why: str) -> None:
-            raise InputError(f"{name} in the robot's settings is {getattr(self, name)!r}: {why}")
+            raise ValueError(f"{name} in the robot's settings is {getattr(self, name)!r}: {why}")
 
         for name in ("tcp_low_m", "tcp_high_m", "crop_low_m", "crop_high_m", "rotation_near_rad"):
             value = np.array(getattr(self, name), dtype=float)
             if value.shape != (3,) or not np.isfinite(value).all():
-                refuse(name, f"give three numbers in {'radians' if name.endswith('_rad') else 'metres'}")
+                refuse(
+                    name,
+                    f"give three numbers in {'radians' if name.endswith('_rad') else 'metres'}",
+                )
         for low, high in (("tcp_low_m", "tcp_high_m"), ("crop_low_m", "crop_high_m")):
             if not (np.array(getattr(self, low)) < np.array(getattr(self, high))).all():
                 refuse(low, f"each number must be below that of {high}")
@@ -118,11 +136,24 @@ class Settings:
             and np.linalg.det(rotation) > 0
             and np.allclose(pose[3], (0, 0, 0, 1))
         ):
-            refuse("camera_to_base", "its upper left 3 x 3 must be a rotation, its last row 0 0 0 1")
+            refuse(
+                "camera_to_base", "its upper left 3 x 3 must be a rotation, its last row 0 0 0 1"
+            )
         if self.outside_box not in ("stop", "clamp"):
             refuse("outside_box", 'use "stop" or "clamp"')
-        limits = {"policy_hz": 30, "servo_hz": 500, "max_speed_m_s": 1.0, "max_speed_rad_s": 3.0, "max_step_m": 0.5}
-        limits |= {"max_step_rad": 3.0, "max_state_age_s": 1.0, "max_hold_s": 60, "num_points": 100_000}
+        limits = {
+            "policy_hz": 30,
+            "servo_hz": 500,
+            "max_speed_m_s": 1.0,
+            "max_speed_rad_s": 3.0,
+            "max_step_m": 0.5,
+        }
+        limits |= {
+            "max_step_rad": 3.0,
+            "max_state_age_s": 1.0,
+            "max_hold_s": 60,
+            "num_points": 100_000,
+        }
         for name, most in limits.items():
             if not 0 < getattr(self, name) <= most:
                 refuse(name, f"use more than 0 and at most {most}")
@@ -136,34 +167,38 @@ class Settings:
 
 
 def load_settings(path: str | Path) -> Settings:
-    """Read --config. Raises InputError, one line, for what is missing, unknown, of the wrong type or out of range."""
+    """Read --config. Raises ValueError, one line, for what is missing, unknown, of the wrong type
+    or out of range.
+    """
     try:
         given = json.loads(Path(path).read_text())
     except FileNotFoundError:
-        raise InputError(f"{path} is missing: copy assets/robot.json and fill in your boxes and camera pose") from None
+        raise ValueError(
+            f"{path} is missing: copy assets/robot.json and fill in your boxes and camera pose"
+        ) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not JSON: {error}") from None
+        raise ValueError(f"{path} is not JSON: {error}") from None
     if not isinstance(given, dict):
-        raise InputError(f"{path} must hold one JSON object")
+        raise ValueError(f"{path} must hold one JSON object")
     known = {f.name: f for f in fields(Settings)}
     if unknown := sorted(set(given) - set(known)):
-        raise InputError(f"{path}: unknown {', '.join(unknown)}; known are {', '.join(known)}")
+        raise ValueError(f"{path}: unknown {', '.join(unknown)}; known are {', '.join(known)}")
     required = [name for name, f in known.items() if f.default is f.default_factory]
     if missing := [name for name in required if name not in given]:
-        raise InputError(f"{path} lacks {', '.join(missing)}")
+        raise ValueError(f"{path} lacks {', '.join(missing)}")
     for name, value in given.items():
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if (known[name].type in ("int", "float") and not number) or (
             known[name].type == "str" and type(value) is not str
         ):
-            raise InputError(f"{path}: {name} is {value!r}, it must be of type {known[name].type}")
+            raise ValueError(f"{path}: {name} is {value!r}, it must be of type {known[name].type}")
     try:
         return Settings(**given)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: {error}") from None
+        raise ValueError(f"{path}: {error}") from None
 
 
-# ---- RTDE: the controller's real-time data exchange ------------------------------------------------------------------
+# ---- RTDE: the controller's real-time data exchange ----------------------------------------------
 
 HEADER = struct.Struct(">HB")  # size of the whole package, type
 REQUEST_VERSION, SETUP_OUTPUTS, SETUP_INPUTS, START, DATA, MESSAGE = map(ord, "VOISUM")
@@ -188,12 +223,20 @@ OUTPUTS = (
     "safety_status_bits",
     "output_int_register_24",
 )
-# Registers 0 to 23 belong to the fieldbus. Written in every package: the pose to go to, and FOLLOW or STOP.
+# Registers 0 to 23 belong to the fieldbus. Written in every package: the pose to go to, and FOLLOW
+# or STOP.
 INPUTS = (*(f"input_double_register_{24 + i}" for i in range(6)), "input_int_register_24")
 STOP, FOLLOW = 0, 1
 RUNNING = 7  # robot_mode
 PROGRAM_RUNNING = 1 << 1  # of robot_status_bits
-SAFETY = {1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop", 6: "emergency stop"}
+SAFETY = {
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "emergency stop",
+}
 SAFETY |= {7: "emergency stop of the robot", 8: "violation", 9: "fault"}
 
 
@@ -217,9 +260,8 @@ class State(NamedTuple):
         """Why the arm must not be moved in this state; None if it may."""
         v = self.values
         if v["safety_mode"] not in (1, 2) or v["safety_status_bits"] & ~0b11:
-            return (
-                f"safety: {SAFETY.get(v['safety_mode'], v['safety_mode'])} (status bits {v['safety_status_bits']:#x})"
-            )
+            mode, bits = v["safety_mode"], v["safety_status_bits"]
+            return f"safety: {SAFETY.get(mode, mode)} (status bits {bits:#x})"
         if v["robot_mode"] != RUNNING:
             return f"the robot is not running (robot mode {v['robot_mode']}, {RUNNING} is running)"
         return None
@@ -228,13 +270,21 @@ class State(NamedTuple):
 class RTDE:
     """A client of the controller's RTDE interface, protocol version 2: one recipe each way.
 
-    A thread keeps the newest state. Nothing is connected again by itself: after a loss, make a new one.
-    `send` and `stop` write the inputs; after `stop` nothing is ever sent.
+    A thread keeps the newest state. Nothing is connected again by itself: after a loss, make a new
+    one. `send` and `stop` write the inputs; after `stop` nothing is ever sent.
 
-    Raises RobotError: refused version, a field NOT_FOUND or IN_USE, no answer, lost connection, lost framing.
+    Raises RobotError: refused version, a field NOT_FOUND or IN_USE, no answer, lost connection,
+    lost framing.
     """
 
-    def __init__(self, host: str, port: int = 30004, hz: float = 125.0, write: bool = False, timeout: float = 2.0):
+    def __init__(
+        self,
+        host: str,
+        port: int = 30004,
+        hz: float = 125.0,
+        write: bool = False,
+        timeout: float = 2.0,
+    ):
         self.name = f"RTDE at {host}:{port}"
         self.buffer, self.newest, self.error, self.stopped = b"", None, None, False
         self.lock, self.arrived = threading.Lock(), threading.Condition()
@@ -245,7 +295,9 @@ class RTDE:
         try:
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self.request(REQUEST_VERSION, struct.pack(">H", 2))[:1] != b"\x01":
-                raise RobotError(f"{self.name} refuses protocol version 2: update the controller's software")
+                raise RobotError(
+                    f"{self.name} refuses protocol version 2: update the controller's software"
+                )
             reply = self.request(SETUP_OUTPUTS, struct.pack(">d", hz) + ",".join(OUTPUTS).encode())
             self.output_recipe, self.output_format = self.recipe(reply, OUTPUTS)
             if write:
@@ -264,14 +316,24 @@ class RTDE:
         types = reply[1:].decode("ascii", "replace").strip(",").split(",")
         for name, kind in zip(names, types):
             if kind not in FORMATS:
-                advice = {"IN_USE": "another client holds it", "NOT_FOUND": "the controller does not know it"}
-                raise RobotError(f"{self.name}: field {name} is {kind} ({advice.get(kind, 'of an unknown type')})")
+                advice = {
+                    "IN_USE": "another client holds it",
+                    "NOT_FOUND": "the controller does not know it",
+                }
+                raise RobotError(
+                    f"{self.name}: field {name} is {kind} "
+                    f"({advice.get(kind, 'of an unknown type')})"
+                )
         if len(types) != len(names) or not reply[0]:
-            raise RobotError(f"{self.name}: the recipe of {len(names)} fields was answered with {len(types)} types")
+            raise RobotError(
+                f"{self.name}: the recipe of {len(names)} fields was answered with {len(types)} "
+                "types"
+            )
         return reply[0], struct.Struct(">" + "".join(FORMATS[kind] for kind in types))
 
     def package(self) -> tuple[int, bytes]:
-        """The next package's type and payload, however the bytes were split or joined on their way."""
+        """The next package's type and payload, however the bytes were split or joined on their "
+        "way."""
         while True:
             if len(self.buffer) >= HEADER.size:
                 size, kind = HEADER.unpack_from(self.buffer)
@@ -283,7 +345,9 @@ class RTDE:
             try:
                 received = self.socket.recv(65536)
             except TimeoutError:
-                raise RobotError(f"{self.name}: no answer for {self.socket.gettimeout():g} s") from None
+                raise RobotError(
+                    f"{self.name}: no answer for {self.socket.gettimeout():g} s"
+                ) from None
             except OSError as error:
                 raise RobotError(f"{self.name}: connection lost: {error}") from None
             if not received:
@@ -326,7 +390,9 @@ class RTDE:
         return State(values, time.monotonic())
 
     def state(self, max_age: float = 0.1) -> State:
-        """The newest state. Raises RobotError if it is older than `max_age` seconds or the connection is lost."""
+        """The newest state. Raises RobotError if it is older than `max_age` seconds or the
+        connection is lost.
+        """
         with self.arrived:
             if self.newest is None and self.error is None:
                 self.arrived.wait(2.0)
@@ -335,12 +401,15 @@ class RTDE:
             raise RobotError(str(error))
         if state is None or state.age > max_age:
             raise RobotError(
-                f"{self.name}: the newest state is {'missing' if state is None else f'{state.age:.3f} s old'}"
+                f"{self.name}: the newest state is "
+                f"{'missing' if state is None else f'{state.age:.3f} s old'}"
             )
         return state
 
     def send(self, pose: np.ndarray) -> bool:
-        """Writes a target pose (6,) for the servo program. False, and nothing is sent, after `stop`."""
+        """Writes a target pose (6,) for the servo program. False, and nothing is sent, after
+        `stop`.
+        """
         with self.lock:
             if not self.stopped:
                 self.write(pose, FOLLOW)
@@ -369,9 +438,10 @@ class RTDE:
         self.thread.join(1.0)
 
 
-# ---- Dashboard and programs on the controller ------------------------------------------------------------------------
+# ---- Dashboard and programs on the controller ----------------------------------------------------
 
-# Runs on the controller. It ends when told to, when RTDE is late (the watchdog), or when no inverse kinematics is found.
+# Runs on the controller. It ends when told to, when RTDE is late (the watchdog), or when no inverse
+# kinematics is found.
 SERVO_PROGRAM = """def dami_servo():
   rtde_set_watchdog("input_int_register_24", {watchdog_hz:.1f}, "stop")
   write_output_integer_register(24, 1)
@@ -414,7 +484,9 @@ def upload(host: str, port: int, program: str) -> None:
         with socket.create_connection((host, port), 2.0) as connection:
             connection.sendall(program.encode())
     except OSError as error:
-        raise RobotError(f"the script port at {host}:{port} does not take the program: {error}") from None
+        raise RobotError(
+            f"the script port at {host}:{port} does not take the program: {error}"
+        ) from None
 
 
 def dashboard(host: str, port: int, *questions: str) -> list[str]:
@@ -435,7 +507,7 @@ def dashboard(host: str, port: int, *questions: str) -> list[str]:
         raise RobotError(f"the dashboard at {host}:{port} does not answer: {error}") from None
 
 
-# ---- Gripper: AG95 over Modbus RTU -----------------------------------------------------------------------------------
+# ---- Gripper: AG95 over Modbus RTU ---------------------------------------------------------------
 
 INITIALIZE, FORCE, POSITION = 0x0100, 0x0101, 0x0103
 INITIALIZED, POSITION_NOW = 0x0200, 0x0202
@@ -454,9 +526,11 @@ def crc16(data: bytes) -> bytes:
 
 
 class Gripper:
-    """An AG95: frames of Modbus RTU over TCP (a serial bridge) or a serial port, 115200 8N1, slave 1.
+    """An AG95: frames of Modbus RTU over TCP (a serial bridge) or a serial port, 115200 8N1, slave
+    1.
 
-    A bad check sum, a time-out or a foreign answer is retried `RETRIES` times; an exception frame, too. Then RobotError.
+    A bad check sum, a time-out or a foreign answer is retried `RETRIES` times; an exception frame,
+    too. Then RobotError.
     """
 
     RETRIES = 3
@@ -468,7 +542,9 @@ class Gripper:
             try:
                 import serial
             except ImportError:
-                raise InputError("a gripper on a serial port needs `pip install pyserial`") from None
+                raise ValueError(
+                    "a gripper on a serial port needs `pip install pyserial`"
+                ) from None
             try:
                 port = serial.Serial(settings.gripper_serial, 115200, timeout=timeout)
             except serial.SerialException as error:
@@ -512,11 +588,15 @@ class Gripper:
             try:
                 self.flush()
                 self.transmit(request)
-                head = self.receive(3)  # slave, function, then a byte count, an exception or the register's high byte
+                head = self.receive(
+                    3
+                )  # slave, function, then a byte count, an exception or the register's high byte
                 if len(head) < 3:
                     problem = "no answer"
                     continue
-                rest = self.receive(2 if head[1] & 0x80 else (head[2] + 2 if function == READ else 5))
+                rest = self.receive(
+                    2 if head[1] & 0x80 else (head[2] + 2 if function == READ else 5)
+                )
             except TimeoutError:
                 problem = "no answer"
                 continue
@@ -532,7 +612,10 @@ class Gripper:
                 problem = "the answer belongs to another request"
             else:
                 return int.from_bytes(answer[3:5] if function == READ else answer[4:6], "big")
-        raise RobotError(f"the gripper at {self.where}: {problem}, {self.RETRIES} times (register {register:#06x})")
+        raise RobotError(
+            f"the gripper at {self.where}: {problem}, {self.RETRIES} times (register "
+            f"{register:#06x})"
+        )
 
     def initialize(self, timeout: float = 10.0) -> None:
         """Initializes it if that was not done yet (it opens and closes), and sets the force."""
@@ -541,7 +624,9 @@ class Gripper:
             deadline = time.monotonic() + timeout
             while self.exchange(READ, INITIALIZED, 1) != 1:
                 if time.monotonic() > deadline:
-                    raise RobotError(f"the gripper at {self.where} is not ready after {timeout:g} s")
+                    raise RobotError(
+                        f"the gripper at {self.where} is not ready after {timeout:g} s"
+                    )
                 time.sleep(0.05)
         self.exchange(WRITE, FORCE, self.force)
 
@@ -557,11 +642,13 @@ class Gripper:
         return 1 - self.exchange(READ, POSITION_NOW, 1) / 1000
 
 
-# ---- Camera: depth to points in the robot's base frame ---------------------------------------------------------------
+# ---- Camera: depth to points in the robot's base frame -------------------------------------------
 
 
 class Intrinsics(NamedTuple):
-    """A pinhole camera, in pixels: focal lengths and the principal point. They must be those of the depth image."""
+    """A pinhole camera, in pixels: focal lengths and the principal point. They must be those of the
+    depth image.
+    """
 
     fx: float
     fy: float
@@ -570,7 +657,9 @@ class Intrinsics(NamedTuple):
 
 
 def depth_to_points(depth: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
-    """Depth (H, W) in metres, 0 where there is none -> points (M, 3) float32, camera frame: right, down, forward."""
+    """Depth (H, W) in metres, 0 where there is none -> points (M, 3) float32, camera frame: right,
+    down, forward.
+    """
     rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
     z = depth[rows, columns]
     x, y = (columns - intrinsics.cx) / intrinsics.fx * z, (rows - intrinsics.cy) / intrinsics.fy * z
@@ -581,37 +670,44 @@ SAMPLED_FROM = 8192  # points at most: 10 ms
 
 
 def cloud(depth: np.ndarray, intrinsics: Intrinsics, settings: Settings) -> np.ndarray:
-    """Depth (H, W) in metres -> the policy's points (N, 3) float32, base frame, cropped and farthest point sampled.
+    """Depth (H, W) in metres -> the policy's points (N, 3) float32, base frame, cropped and
+    farthest point sampled.
 
-    Fewer points than N are repeated; of many, every second, third ... is sampled from: sampling keeps Python's lock, in
-    which no other thread runs, and 300 000 points would hold up the servo stream for a quarter of a second.
-    Raises CameraError if there is no depth, or none of it inside the box.
+    Fewer points than N are repeated; of many, every second, third ... is sampled from: sampling
+    keeps Python's lock, in which no other thread runs, and 300 000 points would hold up the servo
+    stream for a quarter of a second. Raises CameraError if there is no depth, or none of it inside
+    the box.
     """
     points = depth_to_points(depth, intrinsics)
     if len(points) == 0:
-        raise CameraError("the camera's depth is empty: check its cable, its power and what it looks at")
+        raise CameraError(
+            "the camera's depth is empty: check its cable, its power and what it looks at"
+        )
     pose = np.array(settings.camera_to_base)
     points = (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)  # (M, 3) base frame
     inside = ((points >= settings.crop_low_m) & (points <= settings.crop_high_m)).all(axis=1)
     if not inside.any():
         raise CameraError(
-            "no point of the camera lies in the crop box: check camera_to_base and crop_low_m, crop_high_m"
+            "no point of the camera lies in the crop box: check camera_to_base and crop_low_m, "
+            "crop_high_m"
         )
     points = points[inside]
-    return farthest_point_sample(points[:: math.ceil(len(points) / SAMPLED_FROM)], settings.num_points)
+    return farthest_point_sample(
+        points[:: math.ceil(len(points) / SAMPLED_FROM)], settings.num_points
+    )
 
 
 class RealSense:
     """The depth stream of the first RealSense camera found, with that stream's own intrinsics.
 
-    Raises InputError without pyrealsense2, CameraError if the camera does not start.
+    Raises ValueError without pyrealsense2, CameraError if the camera does not start.
     """
 
     def __init__(self, width: int = 640, height: int = 480, hz: int = 30):
         try:
             import pyrealsense2 as rs
         except ImportError:
-            raise InputError(
+            raise ValueError(
                 "a RealSense camera needs `pip install pyrealsense2`; or name a recorded --camera"
             ) from None
         self.pipeline, config = rs.pipeline(), rs.config()
@@ -624,7 +720,9 @@ class RealSense:
         self.intrinsics = realsense_intrinsics(profile.get_stream(rs.stream.depth))
 
     def read(self) -> np.ndarray:
-        """The newest depth image (H, W) float32 in metres. Raises CameraError after a second without one."""
+        """The newest depth image (H, W) float32 in metres. Raises CameraError after a second
+        without one.
+        """
         try:
             frames = self.pipeline.wait_for_frames(1000)
         except RuntimeError as error:
@@ -642,16 +740,25 @@ def realsense_intrinsics(stream: Any) -> Intrinsics:
 
 
 class RecordedCamera:
-    """Replays a file of depth images, over and over: `.npz` with depth (F, H, W) uint16 in millimetres, intrinsics (4,)."""
+    """Replays a file of depth images, over and over: `.npz` with depth (F, H, W) uint16 in
+    millimetres, intrinsics (4,).
+    """
 
     def __init__(self, path: str | Path):
         try:
             with np.load(path, allow_pickle=False) as file:
-                self.depth, self.intrinsics = file["depth"], Intrinsics(*map(float, file["intrinsics"]))
+                self.depth, self.intrinsics = (
+                    file["depth"],
+                    Intrinsics(*map(float, file["intrinsics"])),
+                )
         except (OSError, KeyError, ValueError, TypeError) as error:
-            raise InputError(f"{path} is no recorded camera (depth and intrinsics in an .npz file): {error}") from None
+            raise ValueError(
+                f"{path} is no recorded camera (depth and intrinsics in an .npz file): {error}"
+            ) from None
         if self.depth.ndim != 3 or self.depth.dtype != np.uint16 or len(self.depth) == 0:
-            raise InputError(f"{path}: depth must be (F, H, W) uint16, not {self.depth.shape} {self.depth.dtype}")
+            raise ValueError(
+                f"{path}: depth must be (F, H, W) uint16, not {self.depth.shape} {self.depth.dtype}"
+            )
         self.frame = 0
 
     def read(self) -> np.ndarray:
@@ -663,7 +770,7 @@ class RecordedCamera:
         pass
 
 
-# ---- Streaming motion ------------------------------------------------------------------------------------------------
+# ---- Streaming motion ----------------------------------------------------------------------------
 
 
 def compose(pose: np.ndarray, action: np.ndarray) -> np.ndarray:
@@ -679,9 +786,11 @@ def difference(pose: np.ndarray, later: np.ndarray) -> np.ndarray:
 
 
 def nearer(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Of the two vectors (3,), of angles a and a - 2 pi, that mean one rotation: the one nearer to `reference` (3,).
+    """Of the two vectors (3,), of angles a and a - 2 pi, that mean one rotation: the one nearer to
+    `reference` (3,).
 
-    A tool that points down is half a turn from the base, where the controller's vector jumps from one to the other.
+    A tool that points down is half a turn from the base, where the controller's vector jumps from
+    one to the other.
     """
     angle = np.linalg.norm(rotvec)
     other = rotvec * (1 - 2 * np.pi / angle) if angle > 0 else rotvec
@@ -689,7 +798,9 @@ def nearer(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def toward(pose: np.ndarray, target: np.ndarray, metres: float, radians: float) -> np.ndarray:
-    """From pose to target (6,), but no farther than so many metres and radians: straight, and on SO(3)."""
+    """From pose to target (6,), but no farther than so many metres and radians: straight, and on
+    SO(3).
+    """
     step = difference(pose, target)
     for part, limit in ((slice(0, 3), metres), (slice(3, 6), radians)):
         length = np.linalg.norm(step[part])
@@ -699,15 +810,19 @@ def toward(pose: np.ndarray, target: np.ndarray, metres: float, radians: float) 
 
 
 class Servo:
-    """Streams poses at `servo_hz` from a thread of its own; the policy's inference never holds it up.
+    """Streams poses at `servo_hz` from a thread of its own; the policy's inference never holds it
+    up.
 
-    It interpolates from the pose commanded last (not from the measured one) and clamps the speed. When all targets are
-    reached it holds the last one. It stops for good, and says why, when
+    It interpolates from the pose commanded last (not from the measured one) and clamps the speed.
+    When all targets are reached it holds the last one. It stops for good, and says why, when
 
     - the newest state is older than `max_state_age_s`, or the connection or its framing is lost;
-    - the robot is not running, its safety mode is neither normal nor reduced, or its program no longer runs;
-    - an action has the wrong shape, NaN, or a jump; a target lies outside the box (unless `outside_box` is "clamp");
-    - no new targets come for `max_hold_s`, since the policy is too slow or the camera gives nothing.
+    - the robot is not running, its safety mode is neither normal nor reduced, or its program no
+    longer runs;
+    - an action has the wrong shape, NaN, or a jump; a target lies outside the box (unless
+    `outside_box` is "clamp");
+    - no new targets come for `max_hold_s`, since the policy is too slow or the camera gives
+    nothing.
 
     To stop is to tell the program on the controller to end, once; nothing is sent after that.
     """
@@ -716,12 +831,17 @@ class Servo:
         self.rtde, self.settings, self.moves = rtde, settings, moves
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
-        self.held_since, self.missing = time.monotonic(), "the policy or the camera is too slow"  # why it holds
+        self.held_since, self.missing = (
+            time.monotonic(),
+            "the policy or the camera is too slow",
+        )  # why it holds
         self.lock, self.error, self.ended = threading.Lock(), None, threading.Event()
         self.lateness, self.ages, self.clamped = [], [], False
 
     def start(self, host: str) -> None:
-        """Preloads the actual pose, starts the program on the controller, waits until it runs, and begins to stream."""
+        """Preloads the actual pose, starts the program on the controller, waits until it runs, and
+        begins to stream.
+        """
         settings = self.settings
         if trouble := self.rtde.state(settings.max_state_age_s).trouble():
             raise RobotError(f"the arm is not moved: {trouble}")
@@ -732,7 +852,8 @@ class Servo:
             while not self.program_runs(state := self.rtde.state(settings.max_state_age_s)):
                 if time.monotonic() > deadline:
                     raise RobotError(
-                        f"the servo program does not start: is the robot in remote control? ({state.trouble()})"
+                        "the servo program does not start: is the robot in remote control? "
+                        f"({state.trouble()})"
                     )
                 self.rtde.send(self.pose)
                 time.sleep(1 / settings.servo_hz)
@@ -742,10 +863,15 @@ class Servo:
 
     @staticmethod
     def program_runs(state: State) -> bool:
-        return state.values["robot_status_bits"] & PROGRAM_RUNNING and state.values["output_int_register_24"] == 1
+        return (
+            state.values["robot_status_bits"] & PROGRAM_RUNNING
+            and state.values["output_int_register_24"] == 1
+        )
 
     def follow(self, actions: np.ndarray) -> None:
-        """Takes relative actions (n, 7), one every 1 / policy_hz from now on; raises RobotError for what is refused."""
+        """Takes relative actions (n, 7), one every 1 / policy_hz from now on; raises RobotError for
+        what is refused.
+        """
         settings = self.settings
         actions = np.asarray(actions, dtype=float)
         if actions.ndim != 2 or actions.shape[1] != ACTION_DIM:
@@ -756,7 +882,10 @@ class Servo:
             metres = np.linalg.norm(actions[:, :3], axis=1).max()
             radians = np.linalg.norm(actions[:, 3:6], axis=1).max()
             if metres > settings.max_step_m or radians > settings.max_step_rad:
-                self.fail(f"an action jumps by {metres:.3f} m, {radians:.3f} rad (max_step_m, max_step_rad)")
+                self.fail(
+                    f"an action jumps by {metres:.3f} m, {radians:.3f} rad (max_step_m, "
+                    "max_step_rad)"
+                )
         self.check()
         with self.lock:
             pose, now = self.pose, time.monotonic()
@@ -794,7 +923,8 @@ class Servo:
             pass  # the connection is lost: the watchdog on the controller stops the arm
 
     def tick(self, now: float) -> np.ndarray:
-        """The pose to command now: toward the next target, on time for it, no faster than allowed."""
+        """The pose to command now: toward the next target, on time for it, no faster than "
+        "allowed."""
         settings, dt = self.settings, 1 / self.settings.servo_hz
         with self.lock:
             while len(self.targets) > 1 and self.targets[0][0] <= now:
@@ -803,14 +933,17 @@ class Servo:
                 when, target = self.targets[0]
                 share = min(1.0, dt / max(when - now + dt, dt))
                 goal = compose(self.pose, share * difference(self.pose, target))
-                self.pose = toward(self.pose, goal, settings.max_speed_m_s * dt, settings.max_speed_rad_s * dt)
+                self.pose = toward(
+                    self.pose, goal, settings.max_speed_m_s * dt, settings.max_speed_rad_s * dt
+                )
                 if when <= now and np.allclose(self.pose, target, atol=1e-6):
                     self.targets = []
                 self.held_since = now
             return self.pose
 
     def stream(self) -> None:
-        """The thread: one package every 1 / servo_hz, until something is wrong or `stop` is called."""
+        """The thread: one package every 1 / servo_hz, until something is wrong or `stop` is "
+        "called."""
         period, settings = 1 / self.settings.servo_hz, self.settings
         due = time.monotonic()
         while not self.ended.is_set() and self.error is None:
@@ -829,7 +962,11 @@ class Servo:
                 if self.moves:
                     self.rtde.send(pose)
             except Exception as error:  # whatever it is: without this thread the arm must not go on
-                self.fail(str(error) if isinstance(error, RobotError) else f"the stream broke off: {error!r}")
+                self.fail(
+                    str(error)
+                    if isinstance(error, RobotError)
+                    else f"the stream broke off: {error!r}"
+                )
                 return
             self.lateness.append(now - due)
             self.ages.append(state.age)
@@ -849,12 +986,14 @@ class Servo:
             return "nothing was streamed"
         late, age = 1000 * np.array(self.lateness), 1000 * np.array(self.ages)
         return (
-            f"{len(late)} packages at {self.settings.servo_hz:g} Hz: late by {np.median(late):.2f} ms (median), "
-            f"{np.percentile(late, 99):.2f} ms (99 %), {late.max():.2f} ms (worst); oldest state {age.max():.1f} ms"
+            f"{len(late)} packages at {self.settings.servo_hz:g} Hz: late by {np.median(late):.2f} "
+            "ms (median), "
+            f"{np.percentile(late, 99):.2f} ms (99 %), {late.max():.2f} ms (worst); oldest state "
+            f"{age.max():.1f} ms"
         )
 
 
-# ---- The policy's loop -----------------------------------------------------------------------------------------------
+# ---- The policy's loop ---------------------------------------------------------------------------
 
 
 @dataclass
@@ -867,14 +1006,18 @@ class Cell:
     camera: RealSense | RecordedCamera
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
-        """The present observation: points (N, 3) float32, base frame; state (7,) float32: TCP pose and gripper."""
+        """The present observation: points (N, 3) float32, base frame; state (7,) float32: TCP pose
+        and gripper.
+        """
         points = cloud(self.camera.read(), self.camera.intrinsics, self.settings)
         pose = self.rtde.state(self.settings.max_state_age_s).pose
         pose[3:] = nearer(pose[3:], np.array(self.settings.rotation_near_rad))
         return points, np.append(pose, self.gripper.read()).astype(np.float32)
 
     def wait_for_observation(self, servo: Servo) -> tuple[np.ndarray, np.ndarray]:
-        """`observe`; while the camera gives nothing the arm is held, until `servo` stops it. Then raises RobotError."""
+        """`observe`; while the camera gives nothing the arm is held, until `servo` stops it. Then
+        raises RobotError.
+        """
         while True:
             try:
                 return self.observe()
@@ -899,21 +1042,26 @@ def connect(args: argparse.Namespace, settings: Settings, write: bool) -> Iterat
 
 def run(args: argparse.Namespace, settings: Settings) -> None:
     """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and again."""
-    policy, info = load_trained(args.checkpoint)
+    policy, info = load_checkpoint(args.checkpoint, needs=("text_weights",))
     config = policy.config
-    if (config.state_dim, config.action_dim) != (STATE_DIM, ACTION_DIM) or config.num_points > settings.num_points:
-        raise InputError(
-            f"{args.checkpoint} has {config.state_dim} state, {config.action_dim} action dimensions and {config.num_points} "
-            f"points; the robot {STATE_DIM}, {ACTION_DIM} and {settings.num_points}: use a policy trained on its recordings"
+    if (config.state_dim, config.action_dim) != (
+        STATE_DIM,
+        ACTION_DIM,
+    ) or config.num_points > settings.num_points:
+        raise ValueError(
+            f"{args.checkpoint} has {config.state_dim} state, {config.action_dim} action "
+            f"dimensions and {config.num_points} "
+            f"points; the robot {STATE_DIM}, {ACTION_DIM} and {settings.num_points}: use a policy "
+            "trained on its recordings"
         )
     demonstrations = load_demonstrations(args.data)
-    sampler = window_sampler(policy, demonstrations)
+    sampler = WindowSampler(demonstrations, policy.config)
     text, _ = text_features([demonstrations.instruction], args.clip_weights, info["text_weights"])
     torch.set_num_threads(max(1, (os.cpu_count() or 1) - 1))  # a core is left to the servo stream
     generator = torch.Generator().manual_seed(args.seed)
     demo = sampler.demonstration(generator)  # held for the whole run
     with torch.no_grad():
-        context = policy.encode_demo(text, *(demo[name][None] for name in ("points", "state", "action")))
+        context = policy.encode_demo(text, **demo)
 
     with connect(args, settings, write=not args.dry_run) as cell:
         servo = Servo(cell.rtde, settings, moves=not args.dry_run)
@@ -923,13 +1071,17 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
                 cell.gripper.initialize()
             servo.start(args.host)
             print(
-                f"{demonstrations.task}: running{' without motion' if args.dry_run else ''}; Ctrl-C stops", flush=True
+                f"{demonstrations.task}: running{' without motion' if args.dry_run else ''}; "
+                "Ctrl-C stops",
+                flush=True,
             )
             until = time.monotonic() + args.seconds
             while time.monotonic() < until:
                 points, state = (torch.from_numpy(np.stack(part))[None] for part in zip(*frames))
                 points = points[:, :, : config.num_points]  # (1, To, N, 3), (1, To, S)
-                actions = policy.sample_actions(points, state, context, generator)[0].numpy()  # (Ta, A)
+                actions = policy.sample_actions(points, state, context, generator)[
+                    0
+                ].numpy()  # (Ta, A)
                 frames = execute(cell, servo, actions, config.n_obs_steps, args.dry_run)
         finally:
             servo.stop()
@@ -941,7 +1093,9 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
 def execute(
     cell: Cell, servo: Servo, actions: np.ndarray, n_obs_steps: int, dry_run: bool
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Executes a chunk (Ta, 7); returns the observations of its last steps. Raises RobotError if the arm was stopped."""
+    """Executes a chunk (Ta, 7); returns the observations of its last steps. Raises RobotError if
+    the arm was stopped.
+    """
     servo.follow(actions)
     began, frames = time.monotonic(), []
     for step, action in enumerate(actions, start=1):
@@ -956,11 +1110,13 @@ def execute(
     return frames
 
 
-# ---- Recording -------------------------------------------------------------------------------------------------------
+# ---- Recording -----------------------------------------------------------------------------------
 
 
 class Keys:
-    """The keys pressed so far, one at a time, without waiting: of a terminal, without Enter, or of what stdin brings."""
+    """The keys pressed so far, one at a time, without waiting: of a terminal, without Enter, or of
+    what stdin brings.
+    """
 
     def __enter__(self) -> Keys:
         self.old = termios.tcgetattr(sys.stdin) if sys.stdin.isatty() else None
@@ -975,7 +1131,9 @@ class Keys:
     def pressed(self) -> str:
         """One key, or an empty string. Raises RobotError at the end of the input."""
         while select.select([sys.stdin], [], [], 0)[0]:
-            key = os.read(sys.stdin.fileno(), 1).decode("ascii", "replace")  # past Python's buffer, which hides keys
+            key = os.read(sys.stdin.fileno(), 1).decode(
+                "ascii", "replace"
+            )  # past Python's buffer, which hides keys
             if key == "":
                 raise RobotError("the input has ended: the episode at hand is dropped")
             if key != "\n":
@@ -983,27 +1141,44 @@ class Keys:
         return ""
 
 
-def to_demonstrations(task: str, instruction: str, episodes: list[list[tuple]], meta: dict) -> Demonstrations:
-    """Episodes of frames (points, state, gripper commanded) -> Demonstrations; actions lead from a frame to the next."""
+def to_demonstrations(
+    task: str, instruction: str, episodes: list[list[tuple]], meta: dict
+) -> Demonstrations:
+    """Episodes of frames (points, state, gripper commanded) -> Demonstrations; actions lead from a
+    frame to the next.
+    """
     points, state, action, ends = [], [], [], []
     for episode in episodes:
         poses = [frame[1][:6].astype(float) for frame in episode]
         for index, (cloud_, state_, closed) in enumerate(episode):
             points.append(cloud_.astype(np.float16))
             state.append(state_)
-            action.append(np.append(difference(poses[index], poses[min(index + 1, len(poses) - 1)]), closed))
+            action.append(
+                np.append(difference(poses[index], poses[min(index + 1, len(poses) - 1)]), closed)
+            )
         ends.append(len(points))
-    arrays = (np.stack(points), np.stack(state), np.stack(action).astype(np.float32), np.array(ends, np.int64))
+    arrays = (
+        np.stack(points),
+        np.stack(state),
+        np.stack(action).astype(np.float32),
+        np.array(ends, np.int64),
+    )
     return Demonstrations(task, instruction, *arrays, meta)
 
 
 def record(args: argparse.Namespace, settings: Settings) -> None:
-    """Records demonstrations by hand guidance: the arm is free to be moved, keys begin and end an episode."""
+    """Records demonstrations by hand guidance: the arm is free to be moved, keys begin and end an
+    episode.
+    """
     out = Path(args.out or f"demos/{args.task}.npz")
     episodes: list[list[tuple]] = []
     if out.exists():
-        raise InputError(f"{out} exists: move it, or give another --out")
-    meta = {"made_by": "robot.record", "policy_hz": settings.policy_hz, "num_points": settings.num_points}
+        raise ValueError(f"{out} exists: move it, or give another --out")
+    meta = {
+        "made_by": "robot.record",
+        "policy_hz": settings.policy_hz,
+        "num_points": settings.num_points,
+    }
     with connect(args, settings, write=False) as cell, Keys() as keys:
         cell.observe()  # camera, gripper and arm answer, before anything is set free
         if not args.dry_run:
@@ -1012,7 +1187,8 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
             cell.gripper.initialize()
             upload(args.host, settings.script_port, FREEDRIVE_PROGRAM)
         print(
-            "keys: s starts an episode, e ends and keeps it, d drops it, g opens or closes the gripper, q quits",
+            "keys: s starts an episode, e ends and keeps it, d drops it, g opens or closes the "
+            "gripper, q quits",
             flush=True,
         )
         try:
@@ -1031,13 +1207,20 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
                     print("dropped", flush=True)
                 elif key == "e" and episode:
                     episodes.append(episode)
-                    save_demonstrations(out, to_demonstrations(args.task, args.instruction, episodes, meta))
-                    print(f"episode {len(episodes)}: {len(episode)} frames, saved in {out}", flush=True)
+                    save_demonstrations(
+                        out, to_demonstrations(args.task, args.instruction, episodes, meta)
+                    )
+                    print(
+                        f"episode {len(episodes)}: {len(episode)} frames, saved in {out}",
+                        flush=True,
+                    )
                     episode = None
                 elif key == "q":
                     break
                 if trouble := cell.rtde.state(settings.max_state_age_s).trouble():
-                    raise RobotError(f"{trouble}; the episode at hand is dropped, {len(episodes)} are in {out}")
+                    raise RobotError(
+                        f"{trouble}; the episode at hand is dropped, {len(episodes)} are in {out}"
+                    )
                 if episode is not None:
                     episode.append((*cell.observe(), closed))
                 due += 1 / settings.policy_hz
@@ -1054,20 +1237,36 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
     rows = list(zip(names, dashboard(args.host, settings.dashboard_port, *names)))
     with connect(args, settings, write=False) as cell:
         state = cell.rtde.state(settings.max_state_age_s)
-        inside = (state.pose[:3] >= settings.tcp_low_m).all() and (state.pose[:3] <= settings.tcp_high_m).all()
+        inside = (state.pose[:3] >= settings.tcp_low_m).all() and (
+            state.pose[:3] <= settings.tcp_high_m
+        ).all()
         rows += [
-            ("TCP, m and rad", " ".join(f"{x:.3f}" for x in state.pose) + ("" if inside else " (outside the box)")),
+            (
+                "TCP, m and rad",
+                " ".join(f"{x:.3f}" for x in state.pose) + ("" if inside else " (outside the box)"),
+            ),
             ("state", f"{1000 * state.age:.1f} ms old; {state.trouble() or 'ready'}"),
             (
                 "gripper",
-                f"{cell.gripper.read():.2f} (0 open, 1 closed), state {cell.gripper.exchange(READ, INITIALIZED, 1)}",
+                f"{cell.gripper.read():.2f} (0 open, 1 closed), state "
+                f"{cell.gripper.exchange(READ, INITIALIZED, 1)}",
             ),
         ]
         depth = cell.camera.read()
         points = cloud(depth, cell.camera.intrinsics, settings)
-        rows.append(("camera", f"{(depth > 0).mean():.0%} of {depth.shape[1]} x {depth.shape[0]} pixels have depth"))
         rows.append(
-            ("points", f"{len(points)}, from {points.min(0).round(3)} to {points.max(0).round(3)} m, base frame")
+            (
+                "camera",
+                f"{(depth > 0).mean():.0%} of {depth.shape[1]} x {depth.shape[0]} pixels have "
+                "depth",
+            )
+        )
+        rows.append(
+            (
+                "points",
+                f"{len(points)}, from {points.min(0).round(3)} to {points.max(0).round(3)} m, "
+                "base frame",
+            )
         )
     for name, value in rows:
         print(f"{name:16}{value}")
@@ -1075,33 +1274,51 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
         raise RobotError(f"the arm cannot be moved: {trouble}")
 
 
-# ---- Command line ----------------------------------------------------------------------------------------------------
+# ---- Command line --------------------------------------------------------------------------------
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Record, check and run on a UR10e. Keep a hand on the emergency stop.")
+    parser = argparse.ArgumentParser(
+        description="Record, check and run on a UR10e. Keep a hand on the emergency stop."
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     for name, text in (("check", check.__doc__), ("record", record.__doc__), ("run", run.__doc__)):
         command = commands.add_parser(name, help=text.split("\n")[0], description=text)
-        command.add_argument("--host", required=True, help="address of the robot; nothing else is contacted")
-        command.add_argument("--config", default="robot.json", help="poses, boxes and limits (default: robot.json)")
-        command.add_argument("--camera", metavar="FILE", help="replay a recorded camera instead of the RealSense")
+        command.add_argument(
+            "--host", required=True, help="address of the robot; nothing else is contacted"
+        )
+        command.add_argument(
+            "--config", default="robot.json", help="poses, boxes and limits (default: robot.json)"
+        )
+        command.add_argument(
+            "--camera", metavar="FILE", help="replay a recorded camera instead of the RealSense"
+        )
         if name != "check":
             command.add_argument("--dry-run", action="store_true", help="everything but motion")
         if name == "record":
             command.add_argument("--task", required=True, help="name of the task, and of the file")
             command.add_argument("--instruction", required=True, help="what to do, one sentence")
-            command.add_argument("--episodes", type=int, default=10, help="how many to record (default: 10)")
+            command.add_argument(
+                "--episodes", type=int, default=10, help="how many to record (default: 10)"
+            )
             command.add_argument("--out", help="file to write (default: demos/TASK.npz)")
         if name == "run":
-            command.add_argument("--checkpoint", required=True, help="adapted policy of finetune.py")
-            command.add_argument("--data", required=True, help="the task's demonstrations: one is the reference")
-            command.add_argument("--seconds", type=float, default=60, help="how long (default: 60)")
             command.add_argument(
-                "--seed", type=int, default=0, help="of noise and reference demonstration (default: 0)"
+                "--checkpoint", required=True, help="adapted policy of finetune.py"
             )
             command.add_argument(
-                "--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as in the checkpoint)"
+                "--data", required=True, help="the task's demonstrations: one is the reference"
+            )
+            command.add_argument("--seconds", type=float, default=60, help="how long (default: 60)")
+            command.add_argument(
+                "--seed",
+                type=int,
+                default=0,
+                help="of noise and reference demonstration (default: 0)",
+            )
+            command.add_argument(
+                "--clip-weights",
+                help="CLIP's ViT-B-32.pt, or `random` (default: as in the checkpoint)",
             )
     return parser.parse_args(argv)
 
@@ -1112,4 +1329,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, ModelInputError)
+    command_line(main, RobotError)

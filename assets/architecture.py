@@ -5,7 +5,11 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
-DATA, NETWORK, FROZEN = "#f3e3c3", "#c9dcf2", "#dddddd"  # light fills with dark text: legible on white and on black
+DATA, NETWORK, FROZEN = (
+    "#f3e3c3",
+    "#c9dcf2",
+    "#dddddd",
+)  # light fills with dark text: legible on white and on black
 LINE = "#8a8a8a"
 
 figure = Figure(figsize=(11, 4.6))
@@ -14,10 +18,14 @@ axes.set(xlim=(0, 110), ylim=(0, 46))
 axes.set_axis_off()
 
 
-def box(x: float, y: float, width: float, title: str, text: str, color: str, height: float = 8) -> None:
+def box(
+    x: float, y: float, width: float, title: str, text: str, color: str, height: float = 8
+) -> None:
     """A box whose lower left corner is at (x, y)."""
     style = "round,pad=0,rounding_size=1"
-    axes.add_patch(FancyBboxPatch((x, y), width, height, boxstyle=style, facecolor=color, edgecolor=LINE))
+    axes.add_patch(
+        FancyBboxPatch((x, y), width, height, boxstyle=style, facecolor=color, edgecolor=LINE)
+    )
     lines = text.count("\n") + 1
     middle = y + height / 2
     axes.text(
@@ -30,14 +38,18 @@ def box(x: float, y: float, width: float, title: str, text: str, color: str, hei
         weight="bold",
         color="#222222",
     )
-    axes.text(x + width / 2, middle - 1.1, text, ha="center", va="center", fontsize=8, color="#222222")
+    axes.text(
+        x + width / 2, middle - 1.1, text, ha="center", va="center", fontsize=8, color="#222222"
+    )
 
 
 def arrow(*corners: tuple[float, float], label: str = "", at: tuple[float, float] = (0, 0)) -> None:
     """Straight lines through the corners, the last with a head."""
     axes.plot(*zip(*corners[:-1]), color=LINE, linewidth=1.4, solid_capstyle="round")
     axes.add_patch(
-        FancyArrowPatch(*corners[-2:], arrowstyle="-|>", mutation_scale=12, color=LINE, linewidth=1.4, shrinkA=0)
+        FancyArrowPatch(
+            *corners[-2:], arrowstyle="-|>", mutation_scale=12, color=LINE, linewidth=1.4, shrinkA=0
+        )
     )
     axes.text(*at, label, fontsize=8, color=LINE, ha="center", va="center")
 

@@ -1,7 +1,7 @@
 """Times the pieces that matter, on this machine, side by side: `python -m tests.bench [--paper]`.
 
-Each figure is the median of the repetitions; what is compared takes turns, so that a slow minute of the machine meets
-all of it. The first round is not counted. Nothing else should be running.
+Each figure is the median of the repetitions; what is compared takes turns, so that a slow minute of
+the machine meets all of it. The first round is not counted. Nothing else should be running.
 """
 
 import argparse
@@ -17,21 +17,22 @@ import torch
 from torch.func import functional_call
 from torch.utils.flop_counter import FlopCounterMode
 
-from data import (
-    Demonstrations,
+from clip import text_features
+from data import Demonstrations, WindowSampler, farthest_point_sample, load_demonstrations
+from evaluate import EPISODES_A_JOB, SHIPPED_CHECKPOINT, hardware, pick_device, rollout
+from finetune import BATCH, adapt_policy
+from maml import adapt, meta_gradient
+from model import PRESETS, DAMIPolicy, PolicyConfig, load_checkpoint
+from simulator import (
     MetaWorldPointCloudEnv,
-    WindowSampler,
+    collect,
     demonstration_seed,
     evaluation_seed,
-    farthest_point_sample,
     record_episode,
+    suite_tasks,
 )
-from evaluate import EPISODES_A_JOB, hardware, pick_device, rollout, window_sampler
-from finetune import BATCH, adapt_policy
-from maml import meta_gradient
-from model import PRESETS, DAMIPolicy, PolicyConfig
 from tests.textbook import TextbookDP3, training_step
-from train import SETTINGS, mean_loss_gradient, split, task_batch
+from train import SETTINGS, multi_task_gradient, split, task_batch
 
 DP3 = {"demo_encoder": "none", "tcfm": "none"}
 
@@ -49,8 +50,12 @@ def medians(functions: dict[str, Callable[[], object]], repeat: int) -> dict[str
     return {name: statistics.median(values[1:]) for name, values in times.items()}
 
 
-def step_medians(trainings: dict[str, Callable[[int], list[float]]], steps: int, rounds: int) -> dict[str, float]:
-    """Milliseconds a step of each training, taking turns; a training returns the time at the end of each of its steps."""
+def step_medians(
+    trainings: dict[str, Callable[[int], list[float]]], steps: int, rounds: int
+) -> dict[str, float]:
+    """Milliseconds a step of each training, taking turns; a training returns the time at the end of
+    each of its steps.
+    """
     times = {name: [] for name in trainings}
     for _ in range(rounds):
         for name, training in trainings.items():
@@ -59,7 +64,9 @@ def step_medians(trainings: dict[str, Callable[[int], list[float]]], steps: int,
 
 
 def gflop(function: Callable[[], object]) -> float:
-    """Billions of operations in a call's matrix products and convolutions, a multiplication and an addition each."""
+    """Billions of operations in a call's matrix products and convolutions, a multiplication and an
+    addition each.
+    """
     with FlopCounterMode(display=False) as counter:
         function()
     return counter.get_total_flops() / 1e9
@@ -72,7 +79,9 @@ def matrix_rate(device: torch.device) -> float:
 
 
 def frame_times(task: str, frames: int = 100) -> dict[str, float]:
-    """Milliseconds a frame of an expert episode, on one core: physics (and the expert), rays, sampling."""
+    """Milliseconds a frame of an expert episode, on one core: physics (and the expert), rays,
+    sampling.
+    """
     env = MetaWorldPointCloudEnv(task)
     env.begin(demonstration_seed(task, 0, 0))
     times = {"physics": [], "rays": [], "sampling": []}
@@ -96,46 +105,64 @@ def demonstration(task: str) -> Demonstrations:
     while (episode := record_episode(env, demonstration_seed(task, 0, seed))) is None:
         seed += 1
     arrays = {name: np.stack(values) for name, values in episode[0].items()}
-    return Demonstrations(task, "bench", **arrays, episode_ends=np.array([len(arrays["action"])]), meta={})
+    return Demonstrations(
+        task, "bench", **arrays, episode_ends=np.array([len(arrays["action"])]), meta={}
+    )
 
 
 class Bench:
-    """A fresh policy, one recorded episode, and the calls that train.py, finetune.py and evaluate.py make with them."""
+    """A fresh policy, one recorded episode, and the calls that train.py, finetune.py and
+    evaluate.py make with them.
+    """
 
-    def __init__(self, config: PolicyConfig, preset: str, recorded: Demonstrations, device: torch.device):
+    def __init__(
+        self, config: PolicyConfig, preset: str, recorded: Demonstrations, device: torch.device
+    ):
         torch.manual_seed(0)
         self.preset, self.settings = preset, SETTINGS[preset]
         self.policy = DAMIPolicy(config).to(device)
-        self.sampler: WindowSampler = window_sampler(self.policy, recorded)
+        self.sampler: WindowSampler = WindowSampler(recorded, config, device)
         self.policy.normalizer.fit(self.sampler.points, self.sampler.state, self.sampler.action)
-        self.text = torch.randn(config.text_dim, generator=torch.Generator().manual_seed(0)).to(device)
+        self.text = torch.randn(config.text_dim, generator=torch.Generator().manual_seed(0)).to(
+            device
+        )
 
     def batches(self, tasks: int) -> list[dict[str, torch.Tensor]]:
-        n = self.settings["support"] + self.settings["query"]
-        return [task_batch(self.policy, self.sampler, self.text, n, (0, 0, task)) for task in range(tasks)]
+        n = self.settings.support + self.settings.query
+        return [
+            task_batch(self.policy, self.sampler, self.text, n, (0, 0, task))
+            for task in range(tasks)
+        ]
 
     def outer_step(
-        self, batches: list[dict[str, torch.Tensor]], first_order: bool, vectorize: int | None = None
+        self,
+        batches: list[dict[str, torch.Tensor]],
+        first_order: bool,
+        vectorize: int | None = None,
     ) -> None:
         meta_gradient(
             lambda params, batch: functional_call(self.policy, params, (), batch),
             dict(self.policy.named_parameters()),
-            (split(batch, self.settings["support"]) for batch in batches),
-            self.settings["inner_lr"],
+            (split(batch, self.settings.support) for batch in batches),
+            self.settings.inner_lr,
             first_order=first_order,
-            vectorize=vectorize or self.settings["vectorize"],
+            vectorize=vectorize or self.settings.vectorize,
         )
 
     def one_by_one(self, batches: list[dict[str, torch.Tensor]]) -> None:
         """Multi-task training without a batch over tasks."""
         for batch in batches:
-            mean_loss_gradient(self.policy, [batch])
+            multi_task_gradient(self.policy, [batch])
 
     def adapt(self, steps: int) -> list[float]:
         """The time at the end of each step of finetune.py."""
         times = []
-        on_step = lambda *_: times.append(time.perf_counter())  # noqa: E731
-        adapt_policy(self.policy, self.sampler, self.text, steps, BATCH[self.preset], on_step=on_step)
+
+        def on_step(step: int, loss: float) -> None:
+            times.append(time.perf_counter())
+
+        batch = BATCH[self.preset]
+        adapt_policy(self.policy, self.sampler, self.text, steps, batch, on_step=on_step)
         return times
 
     def textbook(self, steps: int) -> list[float]:
@@ -145,15 +172,15 @@ class Bench:
         optimizer = torch.optim.AdamW(policy.parameters(), lr=1e-4)
         times, generator, n = [], torch.Generator().manual_seed(0), BATCH[self.preset]
         for _ in range(steps):
-            batch = self.sampler.sample(n, generator) | self.policy.draw_noise(n, generator)
+            noise = self.policy.draw_noise_and_timesteps(n, generator)
+            batch = self.sampler.sample(n, generator) | noise
             training_step(policy, average, optimizer, batch)
             times.append(time.perf_counter())
         return times
 
     @torch.no_grad()
     def encode(self) -> tuple[torch.Tensor, ...] | None:
-        demo = {f"demo_{name}": x[None] for name, x in self.sampler.demonstration(0).items()}
-        return self.policy.encode_demo(self.text[None], **demo)
+        return self.policy.encode_demo(self.text[None], **self.sampler.demonstration(0))
 
     def control(self) -> Callable[[], torch.Tensor]:
         context, frames = self.encode(), self.sampler.gather(torch.tensor([100]))
@@ -161,13 +188,20 @@ class Bench:
 
 
 def episode_seconds(task: str, device: torch.device, repeat: int) -> float:
-    """Seconds one core takes for one episode of 200 steps, `small`: as in evaluate.py, never successful (untrained)."""
+    """Seconds one core takes for one episode of 200 steps, `small`: as in evaluate.py, never
+    successful (untrained).
+    """
     bench = Bench(PRESETS["small"], "small", demonstration(task), device)
-    envs = [MetaWorldPointCloudEnv(task, bench.policy.config.num_points) for _ in range(EPISODES_A_JOB)]
+    envs = [
+        MetaWorldPointCloudEnv(task, bench.policy.config.num_points) for _ in range(EPISODES_A_JOB)
+    ]
     seeds = [evaluation_seed(0, i) for i in range(EPISODES_A_JOB)]
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    run = lambda: rollout(bench.policy.eval(), envs, seeds, bench.sampler, bench.text, torch.Generator())  # noqa: E731
+
+    def run() -> None:
+        rollout(bench.policy.eval(), envs, seeds, bench.sampler, bench.text, torch.Generator())
+
     milliseconds = medians({task: run}, repeat)[task]
     torch.set_num_threads(threads)
     return milliseconds / 1000 / EPISODES_A_JOB
@@ -176,7 +210,62 @@ def episode_seconds(task: str, device: torch.device, repeat: int) -> float:
 def peak_memory(tasks: int) -> float:
     """GB that a process of its own holds at most for second-order outer steps of `small`."""
     command = [sys.executable, "-m", "tests.bench", "--peak-memory", str(tasks)]
-    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
+    return float(
+        subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1]
+    )
+
+
+def inner_step_table(folder: str, seeds: int = 5) -> None:
+    """What an inner step does to the policy that ships: 4 + 12 windows of each base task, as in its
+    training, seeds 0 to 4.
+
+    Once with the mean over a window's H x A numbers, as DP3 and this code have it, once with their
+    sum, as the paper writes the loss: an inner rate H x A times as large.
+    """
+    policy, info = load_checkpoint(SHIPPED_CHECKPOINT)
+    tasks, trained = suite_tasks("ml10")[0], info["arguments"]
+    recorded = [load_demonstrations(path) for path in collect(tasks, folder).values()]
+    text, _ = text_features([d.instruction for d in recorded], None, info["text_weights"])
+    windows = trained["after_success"], trained["augment"]
+    samplers = [WindowSampler(d, policy.config, "cpu", *windows) for d in recorded]
+    params = {name: p.detach() for name, p in policy.named_parameters()}
+
+    def loss_fn(params: dict[str, torch.Tensor], batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        return functional_call(policy, params, (), batch)
+
+    def change(new: dict[str, torch.Tensor], old: dict[str, torch.Tensor]) -> float:
+        new, old = (torch.cat([x.flatten() for x in each.values()]) for each in (new, old))
+        return ((new - old).norm() / old.norm()).item()
+
+    print("\n| inner step at 1e-4 on the | weights | support loss | query loss | meta-gradient |")
+    print("|---|---|---|---|---|")
+    for name, numbers in {
+        "mean": 1,
+        "sum": policy.config.horizon * policy.config.action_dim,
+    }.items():
+        lr, moved, losses, gradient = 1e-4 * numbers, [], [], []
+        for seed in range(seeds):
+            n = trained["support"] + trained["query"]
+            batches = [
+                task_batch(policy, sampler, feature, n, (seed, 0, index))
+                for index, (sampler, feature) in enumerate(zip(samplers, text))
+            ]
+            pairs = [split(batch, trained["support"]) for batch in batches]
+            for support, query in pairs:
+                adapted = adapt(loss_fn, params, support, lr)
+                moved.append(change(adapted, params))
+                with torch.no_grad():
+                    after, before = (
+                        [loss_fn(p, b) for b in (support, query)] for p in (adapted, params)
+                    )
+                losses.append([(a / b - 1).item() for a, b in zip(after, before)])
+            plain, _ = meta_gradient(loss_fn, params, pairs, lr=0.0)
+            gradient.append(change(meta_gradient(loss_fn, params, pairs, lr)[0], plain))
+        support, query = np.median(losses, axis=0)
+        cells = (
+            f"{np.median(moved):.1e} | {support:+.1%} | {query:+.1%} | {np.median(gradient):.1%}"
+        )
+        print(f"| {name} (medians) | {cells} |", flush=True)
 
 
 def table(title: str, rows: dict[str, float], unit: str = "") -> None:
@@ -189,31 +278,54 @@ def preset_table(bench: Bench, rate: float, repeat: int) -> None:
     """Every kind of step of a preset, and how far it is from the machine's limit."""
     batches, control = bench.batches(10), bench.control()
     steps = {
-        "outer step, second order": lambda n=None: bench.outer_step(batches, first_order=False, vectorize=n),
-        "outer step, first order": lambda n=None: bench.outer_step(batches, first_order=True, vectorize=n),
-        "multi-task step, all windows in one batch": lambda: mean_loss_gradient(bench.policy, batches),
+        "outer step, second order": lambda n=None: bench.outer_step(
+            batches, first_order=False, vectorize=n
+        ),
+        "outer step, first order": lambda n=None: bench.outer_step(
+            batches, first_order=True, vectorize=n
+        ),
+        "multi-task step, all windows in one batch": lambda: multi_task_gradient(
+            bench.policy, batches
+        ),
         "multi-task step, one task at a time": lambda: bench.one_by_one(batches),
     }
     ms = medians(steps, repeat)
     second, first, batch, single = ms.values()
     ms |= step_medians({"adaptation step": bench.adapt}, steps=5, rounds=3)
     ms |= medians({"control step": control, "encoding the demonstration": bench.encode}, repeat)
-    # Grouped convolutions, which vmap makes, are not counted rightly: outer steps are counted task by task.
+    # Grouped convolutions, which vmap makes, are not counted rightly: outer steps are counted task
+    # by task.
     counted = [lambda s=s: s(1) for s in list(steps.values())[:2]] + list(steps.values())[2:]
     counted += [lambda: bench.adapt(1), control, bench.encode]
-    print(f"\n| `{bench.preset}`, 10 tasks | ms | GFLOP | of the matrix product's rate |\n|---|---|---|---|")
+    print(
+        f"\n| `{bench.preset}`, 10 tasks | ms | GFLOP | of the matrix product's rate "
+        "|\n|---|---|---|---|"
+    )
     for (name, value), call in zip(ms.items(), counted):
         operations = gflop(call)
-        print(f"| {name} | {value:.1f} | {operations:.2f} | {operations / value * 1000 / rate:.0%} |", flush=True)
-    ratios = {"first order": second / first, "one batch": second / batch, "one task at a time": second / single}
+        print(
+            f"| {name} | {value:.1f} | {operations:.2f} | {operations / value * 1000 / rate:.0%} |",
+            flush=True,
+        )
+    ratios = {
+        "first order": second / first,
+        "one batch": second / batch,
+        "one task at a time": second / single,
+    }
     table(f"`{bench.preset}`: second order over", ratios)
 
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--paper", action="store_true", help="the ratios at the paper's size too (10 minutes more, 16 GB)"
+        "--paper",
+        action="store_true",
+        help="the ratios at the paper's size too (10 minutes more, 16 GB)",
     )
+    parser.add_argument(
+        "--inner-step", action="store_true", help="only what it does to the shipped policy"
+    )
+    parser.add_argument("--data", default="data", help="demonstrations that --inner-step reads")
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--device")
     parser.add_argument("--peak-memory", type=int, help=argparse.SUPPRESS)
@@ -227,15 +339,23 @@ def main(argv: list[str] | None = None) -> None:
             bench.outer_step(bench.batches(args.peak_memory), first_order=False)
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
         return
+    if args.inner_step:
+        return inner_step_table(args.data)
     threads = torch.get_num_threads()
-    print(f"{hardware(device)}, torch {torch.__version__}, {threads} threads, {time.strftime('%Y-%m-%d')}")
+    print(
+        f"{hardware(device)}, torch {torch.__version__}, {threads} threads, "
+        f"{time.strftime('%Y-%m-%d')}"
+    )
 
     print("\n| frame, one core, ms | physics | rays | sampling | all |\n|---|---|---|---|---|")
     for task in ("reach", "shelf-place", "basketball"):
         times = frame_times(task)
         cells = [f"{ms:.1f}" for ms in (*times.values(), sum(times.values()))]
         print(f"| {task} | {' | '.join(cells)} |", flush=True)
-    episodes = {task: episode_seconds(task, device, args.repeat) for task in ("reach", "shelf-place", "basketball")}
+    episodes = {
+        task: episode_seconds(task, device, args.repeat)
+        for task in ("reach", "shelf-place", "basketball")
+    }
     table("evaluation, one core, `small`: seconds an episode of 200 steps", episodes)
 
     recorded = demonstration("drawer-close")
@@ -243,7 +363,10 @@ def main(argv: list[str] | None = None) -> None:
     print(f"\nmatrix product: {rate:.0f} GFLOP a second")
     for preset in ("small", "tiny"):
         preset_table(Bench(PRESETS[preset], preset, recorded, device), rate, args.repeat)
-    table("`small`, second order, peak memory, GB", {f"{tasks} tasks": peak_memory(tasks) for tasks in (10, 20, 40)})
+    table(
+        "`small`, second order, peak memory, GB",
+        {f"{tasks} tasks": peak_memory(tasks) for tasks in (10, 20, 40)},
+    )
 
     for preset, steps, rounds in (("small", 4, 5), ("paper", 2, 3)):
         if preset == "paper" and not args.paper:
@@ -251,7 +374,9 @@ def main(argv: list[str] | None = None) -> None:
         dami = Bench(PRESETS[preset], preset, recorded, device)
         dp3 = Bench(replace(PRESETS[preset], **DP3), preset, recorded, device)
         ms = step_medians(
-            {"DAMI": dami.adapt, "DP3": dp3.adapt, "DP3 as a textbook writes it": dp3.textbook}, steps, rounds
+            {"DAMI": dami.adapt, "DP3": dp3.adapt, "DP3 as a textbook writes it": dp3.textbook},
+            steps,
+            rounds,
         )
         table(f"`{preset}`, adaptation step, {BATCH[preset]} windows, ms", ms)
         control = medians({"DAMI": dami.control(), "DP3": dp3.control()}, args.repeat)
@@ -259,7 +384,8 @@ def main(argv: list[str] | None = None) -> None:
         ratios = {
             "adaptation step, DAMI over DP3": ms["DAMI"] / ms["DP3"],
             "control step, DAMI over DP3": control["DAMI"] / control["DP3"],
-            "training step of DP3, ours over the textbook's": ms["DP3"] / ms["DP3 as a textbook writes it"],
+            "training step of DP3, ours over the textbook's": ms["DP3"]
+            / ms["DP3 as a textbook writes it"],
         }
         table(f"`{preset}`, ratios", ratios)
         del dami, dp3
@@ -267,8 +393,13 @@ def main(argv: list[str] | None = None) -> None:
         bench = Bench(PRESETS["paper"], "paper", recorded, device)
         batches = bench.batches(1)
         orders = {"second order": False, "first order": True}
-        ms = medians({k: lambda f=f: bench.outer_step(batches, first_order=f) for k, f in orders.items()}, args.repeat)
-        table("`paper`, outer step, one task, s", {name: value / 1000 for name, value in ms.items()})
+        ms = medians(
+            {k: lambda f=f: bench.outer_step(batches, first_order=f) for k, f in orders.items()},
+            args.repeat,
+        )
+        table(
+            "`paper`, outer step, one task, s", {name: value / 1000 for name, value in ms.items()}
+        )
 
 
 if __name__ == "__main__":

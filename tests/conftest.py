@@ -1,19 +1,112 @@
-"""What several test files share: real demonstrations of four tasks of ML10, collected once a session."""
+"""What several test files share: real demonstrations, one short run of train.py, small helpers."""
 
+import functools
+import hashlib
+import json
 import os
+import signal
+
+os.environ["OMP_NUM_THREADS"] = "1"  # before torch; on small matrices threads wait
 
 import pytest
+import torch
 
-os.environ["OMP_NUM_THREADS"] = "1"  # before torch; on matrices this small, threads only wait for each other
-
+import clip
 import data
+import evaluate
+import model
+import simulator
+import train
 
 BASE, NOVEL = ["reach", "drawer-close", "window-open"], ["door-close"]
+SMALL_ML10 = {"train": [f"{task}-v3" for task in BASE], "test": [f"{task}-v3" for task in NOVEL]}
+FEW = (
+    "--suite ml10 --preset tiny --steps 6 --checkpoint-every 3 --demonstrations 2 --episodes 0 "
+    "--clip-weights random --device cpu"
+).split()
 
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory):
     """A folder with two expert demonstrations of each task in BASE and NOVEL."""
     folder = tmp_path_factory.mktemp("demonstrations")
-    data.collect(BASE + NOVEL, folder, episodes=2)
+    simulator.collect(BASE + NOVEL, folder, episodes=2)
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_suite():
+    """ML10 with three of its ten base tasks; the text tower is built once, not at every call."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(simulator.SUITES, "ml10", SMALL_ML10)
+        cached = functools.cache(clip.load_clip_text_encoder)
+        patch.setattr(clip, "load_clip_text_encoder", cached)
+        yield
+
+
+@pytest.fixture
+def own_folder(tmp_path, monkeypatch):
+    """The test runs in an empty folder, and leaves the process as it was."""
+    handler, threads = signal.getsignal(signal.SIGINT), torch.get_num_threads()
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    signal.signal(signal.SIGINT, handler)
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def run(recorded, small_suite, tmp_path_factory):
+    """The folder of a run of train.py with evaluation, to be left as it is."""
+    folder = tmp_path_factory.mktemp("trained")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(evaluate, "EPISODES_A_JOB", 1)  # jobs enough for both workers
+        options = "--episodes 2 --evaluate-every 6 --workers 2".split()
+        train.main([*FEW, *options, "--data", str(recorded)])
+    return folder / "runs" / "ml10-tiny-seed0"
+
+
+def fails(script, argv, capsys):
+    """Runs a script that must end with exit code 2 and one line on stderr; returns the line."""
+    capsys.readouterr()
+    errors = [script.RobotError] if hasattr(script, "RobotError") else []
+    with pytest.raises(SystemExit) as end:
+        data.command_line(lambda: script.main([str(arg) for arg in argv]), *errors)
+    error = capsys.readouterr().err.split("\r")[-1]  # after a progress bar
+    line = error.strip("\n").split("\n")[-1]
+    assert end.value.code == 2 and line.startswith("error: ") and "Traceback" not in error, error
+    return line
+
+
+def weights(path):
+    """A checkpoint's state_dict and information."""
+    policy, info = model.load_checkpoint(path)
+    return policy.state_dict(), info
+
+
+def same_bits(a, b):
+    """Whether two nested checkpoints are equal, bit for bit."""
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same_bits(a[key], b[key]) for key in a)
+    if isinstance(a, list):
+        return len(a) == len(b) and all(map(same_bits, a, b))
+    return a == b
+
+
+def whole_state(folder):
+    """Policy, EMA, optimizer and step of a run's last.pt; not the seconds."""
+    policy, info = weights(folder / "last.pt")
+    return {"ema": dict(policy), "training": info["training"], "step": info["step"]}
+
+
+def fingerprint(folder):
+    """File -> SHA-256 of its content."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def metrics(folder):
+    """The lines of a run's metrics.jsonl."""
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]

@@ -1,12 +1,15 @@
-"""An emulated UR10e with an AG95 gripper on loopback: RTDE, script port, dashboard, Modbus RTU; and their faults.
+"""An emulated UR10e with an AG95 gripper on loopback: RTDE, script port, dashboard, Modbus RTU; and
+their faults.
 
-    python -m tests.emulator                # on the real ports, until Ctrl-C: follow the README's robot section with it
-    python -m tests.emulator --hand 2       # and a hand that moves the arm while it is free, for recording
+    python -m tests.emulator                # on the real ports, until Ctrl-C: follow the README's
+    robot section with it python -m tests.emulator --hand 2       # and a hand that moves the arm
+    while it is free, for recording
 
-It shares no code with robot.py, so that both can be wrong only in different ways; `tests/test_robot.py` has `ur-rtde`
-read it. Emulated are: recipes and their ownership by a connection, data packages at the asked frequency, a program that
-follows input registers (read from its text: registers, loop condition, watchdog), first-order motion of the arm, and
-the gripper's registers. Not emulated: kinematics (joints are made up), dynamics, collisions, URScript in general.
+It shares no code with robot.py, so that both can be wrong only in different ways;
+`tests/test_robot.py` has `ur-rtde` read it. Emulated are: recipes and their ownership by a
+connection, data packages at the asked frequency, a program that follows input registers (read from
+its text: registers, loop condition, watchdog), first-order motion of the arm, and the gripper's
+registers. Not emulated: kinematics (joints are made up), dynamics, collisions, URScript in general.
 """
 
 import argparse
@@ -70,7 +73,14 @@ class Faults:
 class Emulator:
     """All of it, in threads; a context manager. Ports of 0 are chosen freely; see `ports`."""
 
-    def __init__(self, rtde: int = 0, script: int = 0, dashboard: int = 0, gripper: int = 0, hand: float = 0.0):
+    def __init__(
+        self,
+        rtde: int = 0,
+        script: int = 0,
+        dashboard: int = 0,
+        gripper: int = 0,
+        hand: float = 0.0,
+    ):
         self.faults, self.lock = Faults(), threading.RLock()
         self.ended = threading.Event()
         self.pose, self.speed, self.free = list(START_POSE), [0.0] * 6, False
@@ -87,7 +97,12 @@ class Emulator:
         self.opening, self.hand, self.began = 1000.0, hand, time.monotonic()
         self.servers = {
             name: socket.create_server(("127.0.0.1", port))
-            for name, port in {"rtde": rtde, "script": script, "dashboard": dashboard, "gripper": gripper}.items()
+            for name, port in {
+                "rtde": rtde,
+                "script": script,
+                "dashboard": dashboard,
+                "gripper": gripper,
+            }.items()
         }
         self.ports = {name: server.getsockname()[1] for name, server in self.servers.items()}
 
@@ -108,7 +123,9 @@ class Emulator:
         while not self.ended.is_set():
             with contextlib.suppress(OSError):
                 if select.select([server], [], [], 0.1)[0]:
-                    threading.Thread(target=self.guard, args=(handler, server.accept()[0]), daemon=True).start()
+                    threading.Thread(
+                        target=self.guard, args=(handler, server.accept()[0]), daemon=True
+                    ).start()
 
     def guard(self, handler, connection: socket.socket) -> None:
         with connection, contextlib.suppress(OSError):  # the client is gone
@@ -143,15 +160,24 @@ class Emulator:
         if target is not None:
             self.pose = [p + share * (t - p) for p, t in zip(self.pose, target)]
         self.speed = [(p - b) / dt for p, b in zip(self.pose, before)]
-        self.opening += (1 - math.exp(-dt / GRIPPER_SECONDS)) * (self.registers[0x0103] - self.opening)
+        self.opening += (1 - math.exp(-dt / GRIPPER_SECONDS)) * (
+            self.registers[0x0103] - self.opening
+        )
         self.registers[0x0202] = round(self.opening)
         self.registers[0x0201] = 1 if abs(self.opening - self.registers[0x0103]) < 5 else 0
 
     def run_program(self) -> list[float] | None:
         """One turn of the servo program's loop; None when it has ended."""
         p = self.program
-        stopped = self.faults.safety_mode not in (1, 2) or self.faults.robot_mode != 7 or self.faults.lose_program
-        late = p["watchdog"] and time.monotonic() - self.written.get(p["watchdog"], p["began"]) > 1 / p["hz"]
+        stopped = (
+            self.faults.safety_mode not in (1, 2)
+            or self.faults.robot_mode != 7
+            or self.faults.lose_program
+        )
+        late = (
+            p["watchdog"]
+            and time.monotonic() - self.written.get(p["watchdog"], p["began"]) > 1 / p["hz"]
+        )
         if p["kind"] == "freedrive":
             if stopped:
                 self.program, self.free = None, False
@@ -178,7 +204,11 @@ class Emulator:
             if self.faults.no_program or not re.match(r"def \w+\(\):\n(  .*\n)+end\n$", program):
                 return
             if "freedrive_mode()" in program and "end_freedrive_mode()" not in program:
-                self.program, self.free, self.began = {"kind": "freedrive", "watchdog": None}, True, time.monotonic()
+                self.program, self.free, self.began = (
+                    {"kind": "freedrive", "watchdog": None},
+                    True,
+                    time.monotonic(),
+                )
             loop = re.search(r"while read_input_integer_register\((\d+)\) == (\d+):", program)
             pose = re.search(r"p\[(.*)\]", program)
             if loop and pose and "get_inverse_kin(pose" in program and "servoj(q, t=" in program:
@@ -188,7 +218,10 @@ class Emulator:
                     "kind": "servo",
                     "while": f"input_int_register_{loop[1]}",
                     "value": int(loop[2]),
-                    "pose": [f"input_double_register_{n}" for n in re.findall(r"float_register\((\d+)\)", pose[1])],
+                    "pose": [
+                        f"input_double_register_{n}"
+                        for n in re.findall(r"float_register\((\d+)\)", pose[1])
+                    ],
                     "watchdog": watchdog and watchdog[1],
                     "hz": watchdog and float(watchdog[2]),
                     "state": f"output_int_register_{state[1]}",
@@ -209,7 +242,8 @@ class Emulator:
                     "safetystatus": f"Safetystatus: {safety.get(self.faults.safety_mode, 'FAULT')}",
                     "programState": f"{'PLAYING' if self.program else 'STOPPED'} dami",
                 }
-                connection.sendall(f"{answers.get(line.strip(), 'could not understand: ' + line.strip())}\n".encode())
+                answer = answers.get(line.strip(), f"could not understand: {line.strip()}")
+                connection.sendall(f"{answer}\n".encode())
 
     # ---- RTDE
 
@@ -232,7 +266,15 @@ class Emulator:
         }[name]
 
     def serve_rtde(self, connection: socket.socket) -> None:
-        me, names, frequency, inputs, sending, buffer, due = id(connection), [], 125.0, [], False, b"", 0.0
+        me, names, frequency, inputs, sending, buffer, due = (
+            id(connection),
+            [],
+            125.0,
+            [],
+            False,
+            b"",
+            0.0,
+        )
         batch: list[bytes] = []
 
         def send(kind: str, payload: bytes) -> None:
@@ -245,13 +287,18 @@ class Emulator:
 
         def set_up(asked: bytes, types: dict[str, str]) -> tuple[list[str], list[str]]:
             fields = [name for name in asked.decode().split(",") if name]
-            kinds = ["NOT_FOUND" if n in self.faults.not_found else types.get(n, "NOT_FOUND") for n in fields]
+            kinds = [
+                "NOT_FOUND" if n in self.faults.not_found else types.get(n, "NOT_FOUND")
+                for n in fields
+            ]
             return fields, kinds
 
         try:
             while not self.ended.is_set() and not self.faults.drop:
                 wait = max(0.0, due - time.monotonic()) if sending else 0.05
-                readable = not self.faults.deaf and select.select([connection], [], [], min(wait, 0.05))[0]
+                readable = (
+                    not self.faults.deaf and select.select([connection], [], [], min(wait, 0.05))[0]
+                )
                 if self.faults.deaf:
                     time.sleep(min(wait, 0.05))
                 if readable:
@@ -259,7 +306,9 @@ class Emulator:
                     if not part:
                         return
                     buffer += part
-                while len(buffer) >= 3 and len(buffer) >= (size := struct.unpack_from(">H", buffer)[0]):
+                while len(buffer) >= 3 and len(buffer) >= (
+                    size := struct.unpack_from(">H", buffer)[0]
+                ):
                     kind, payload, buffer = chr(buffer[2]), buffer[3:size], buffer[size:]
                     if kind == "V":
                         send("V", bytes([not self.faults.refuse_version]))
@@ -286,7 +335,9 @@ class Emulator:
                         sending = False
                         send("P", b"\x01")
                     elif kind == "U":
-                        layout = struct.Struct(">B" + "".join(CODES[INPUT_TYPES[name]] for name in inputs))
+                        layout = struct.Struct(
+                            ">B" + "".join(CODES[INPUT_TYPES[name]] for name in inputs)
+                        )
                         _, *values = layout.unpack(payload)
                         with self.lock:
                             now = time.monotonic()
@@ -300,7 +351,8 @@ class Emulator:
                         for name in names:
                             value = self.value(name)
                             payload += struct.pack(
-                                ">" + CODES[TYPES[name]], *(value if isinstance(value, tuple) else (value,))
+                                ">" + CODES[TYPES[name]],
+                                *(value if isinstance(value, tuple) else (value,)),
                             )
                     if self.faults.garbage:
                         connection.sendall(struct.pack(">HB", 1, ord("U")) + payload)
@@ -339,7 +391,11 @@ class Emulator:
     def answer(self, frame: bytes) -> bytes:
         slave, function, register, value = struct.unpack(">BBHH", frame[:6])
         with self.lock:
-            if self.faults.gripper_exception or register not in self.registers or function not in (3, 6):
+            if (
+                self.faults.gripper_exception
+                or register not in self.registers
+                or function not in (3, 6)
+            ):
                 self.faults.gripper_exception = max(0, self.faults.gripper_exception - 1)
                 body = bytes([slave, function | 0x80, 2])
             elif function == 3:
@@ -353,12 +409,16 @@ class Emulator:
 
 
 def write_scene(path, frames: int = 20) -> None:
-    """A recorded camera: 0.9 m above a table, looking straight down at a cube of 5 cm that slides to and fro."""
+    """A recorded camera: 0.9 m above a table, looking straight down at a cube of 5 cm that slides
+    to and fro.
+    """
     height, width, focal = 120, 160, 140.0
     rows, columns = np.mgrid[:height, :width]
     depth = np.empty((frames, height, width), np.uint16)
     for frame in range(frames):
-        x = CAMERA[0] + (columns - width / 2) / focal * 0.85  # where a ray meets the plane of the cube's top
+        x = (
+            CAMERA[0] + (columns - width / 2) / focal * 0.85
+        )  # where a ray meets the plane of the cube's top
         y = CAMERA[1] - (rows - height / 2) / focal * 0.85
         center = CAMERA[0] + 0.05 * math.sin(2 * math.pi * frame / frames)
         on_top = (abs(x - center) < 0.025) & (abs(y - CAMERA[1]) < 0.025)
@@ -385,8 +445,12 @@ CRC_TABLE = [table_entry(value) for value in range(256)]
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Emulate a UR10e and its gripper on loopback.")
-    parser.add_argument("--hand", type=float, default=4.0, help="seconds a round of the hand that guides a free arm")
-    parser.add_argument("--scene", metavar="FILE", default="scene.npz", help="recorded camera to write (scene.npz)")
+    parser.add_argument(
+        "--hand", type=float, default=4.0, help="seconds a round of the hand that guides a free arm"
+    )
+    parser.add_argument(
+        "--scene", metavar="FILE", default="scene.npz", help="recorded camera to write (scene.npz)"
+    )
     args = parser.parse_args(argv)
     write_scene(args.scene)
     print(f"wrote {args.scene}, a recorded camera")

@@ -1,10 +1,12 @@
-"""RESULTS.json, and what the README shows of it: tables, a learning curve, a chart.
+"""RESULTS.json, and what README and RESULTS.md show of it: tables, a learning curve, a chart.
 
-    python -m tests.results runs/seeds    # takes this report of evaluate.py into RESULTS.json
-    python -m tests.results               # writes the README's tables, draws the pictures
+    python -m tests.results runs/seeds         # takes a report of evaluate.py into RESULTS.json
+    python -m tests.results                    # writes the tables, draws the pictures
+    python -m tests.results --ship CHECKPOINT  # makes it assets/ml10-small.pt, weights as float16
 
-RESULTS.json keeps for each report every episode (1: success, 0: not), the command that measured it, hardware, seed and
-date; and for each training run that a report names its settings, command and time.
+RESULTS.json keeps for each report every episode (1: success, 0: not), the command that measured it,
+hardware, seed and date; and for each training run that a report names its settings, command and
+time.
 """
 
 import json
@@ -15,8 +17,18 @@ from pathlib import Path
 
 import numpy as np
 
-from data import suite_tasks
-from evaluate import Successes, format_success, mean_interval, mean_success, paper_success, write_atomically
+from data import write_atomically
+from evaluate import (
+    SHIPPED_CHECKPOINT,
+    TRAINED,
+    Successes,
+    format_success,
+    mean_interval,
+    mean_success,
+    paper_success,
+)
+from model import load_checkpoint, save_checkpoint
+from simulator import suite_tasks
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "RESULTS.json"
@@ -31,7 +43,10 @@ NOVEL_COLUMNS = {
 }
 ABLATIONS = [  # what is different in it, reports
     ("DAMI", SEEDS),
-    ("no MAML at all (`--maml off`)", ["eval-multi-task", "eval-multi-task-seed1", "eval-multi-task-seed2"]),
+    (
+        "no MAML at all (`--maml off`)",
+        ["eval-multi-task", "eval-multi-task-seed1", "eval-multi-task-seed2"],
+    ),
     ("DAMI", ["eval-short-dami"]),
     ("an inner rate 30 times as large (`--inner-lr 3e-3`)", ["eval-short-inner"]),
     ("first order instead of second (`--maml first`)", ["eval-short-first-order"]),
@@ -48,17 +63,26 @@ def take(results: dict, folder: Path) -> None:
     report = json.loads((folder / "success.json").read_text())
     for kind in ("successes", "checkpoints"):
         for label, successes in report.get(kind, {}).items():
-            report[kind][label] = {task: "".join(str(int(s)) for s in episodes) for task, episodes in successes.items()}
+            report[kind][label] = {
+                task: "".join(str(int(s)) for s in episodes) for task, episodes in successes.items()
+            }
     results["evaluations"][folder.name] = report
     for run in {label.split("/")[0] for label in report["successes"]} - {"assets"}:
         path = folder.parent / run
         lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
         minutes = [line["seconds"] for line in lines if "loss" in line][-1] / 60
-        results["trainings"][run] = {"minutes": round(minutes, 1), **json.loads((path / "config.json").read_text())}
+        results["trainings"][run] = {
+            "minutes": round(minutes, 1),
+            **json.loads((path / "config.json").read_text()),
+        }
 
 
-def successes(results: dict, reports: Sequence[str], kind: str = "successes") -> dict[str, Successes]:
-    """Label -> task -> episodes of reports: of the last checkpoints, or of all (kind `checkpoints`)."""
+def successes(
+    results: dict, reports: Sequence[str], kind: str = "successes"
+) -> dict[str, Successes]:
+    """Label -> task -> episodes of reports: of the last checkpoints, or of all (kind
+    `checkpoints`).
+    """
     return {
         label: {task: [c == "1" for c in episodes] for task, episodes in tasks.items()}
         for report in reports
@@ -71,7 +95,9 @@ def curves(results: dict, reports: Sequence[str], tasks: list[str]) -> dict[str,
     found: dict[str, dict[int, float]] = {}
     for label, measured in successes(results, reports, "checkpoints").items():
         run, checkpoint = label.split("/")
-        found.setdefault(run, {})[int(checkpoint.removeprefix("ema-"))] = mean_success(only(measured, tasks))
+        found.setdefault(run, {})[int(checkpoint.removeprefix("ema-"))] = mean_success(
+            only(measured, tasks)
+        )
     return found
 
 
@@ -92,54 +118,92 @@ def mean_of_runs(runs: list[Successes], tasks: list[str]) -> str:
     return mean_interval([mean_success(only(run, tasks)) for run in runs])
 
 
-def seeds_table(results: dict, tasks: list[str], columns: dict[str, list[str]], checkpoints: Sequence[str] = ()) -> str:
-    """A row a task: the seeds' episodes together, a column for some reports; then the means over seeds.
+def seeds_table(
+    results: dict, tasks: list[str], columns: dict[str, list[str]], checkpoints: Sequence[str] = ()
+) -> str:
+    """A row a task: the seeds' episodes together, a column for some reports; then the means over
+    seeds.
 
-    With the reports of every checkpoint also the paper's number: the mean of the five best checkpoints of each run.
+    With the reports of every checkpoint also the paper's number: the mean of the five best
+    checkpoints of each run.
     """
-    lines = [f"| task | {' | '.join(columns)} | paper, DP3 | paper, DAMI |", "|---" * (len(columns) + 3) + "|"]
+    lines = [
+        f"| task | {' | '.join(columns)} | paper, DP3 | paper, DAMI |",
+        "|---" * (len(columns) + 3) + "|",
+    ]
     runs = {title: list(successes(results, reports).values()) for title, reports in columns.items()}
     paper = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
     dp3 = {task: (paper["base"] | paper["novel"])[task]["DP3"] for task in tasks}
     for task in tasks:
-        cells = [pooled({task: [s for run in seeds for s in run[task]]}, [task]) for seeds in runs.values()]
-        lines.append(f"| {task} | {' | '.join(cells)} | {dp3[task]:.1f} | {paper_success('ml10', task):.1f} |")
+        cells = [
+            pooled({task: [s for run in seeds for s in run[task]]}, [task])
+            for seeds in runs.values()
+        ]
+        lines.append(
+            f"| {task} | {' | '.join(cells)} | {dp3[task]:.1f} | {paper_success('ml10', task):.1f} "
+            "|"
+        )
     means = [mean_of_runs(seeds, tasks) for seeds in runs.values()]
     ours = np.mean([paper_success("ml10", task) for task in tasks])
     of_paper = f"{np.mean(list(dp3.values())):.1f} | {ours:.1f} |"
     lines.append(f"| **mean** | {' | '.join(means)} | {of_paper}")
     if checkpoints:
-        best = [float(np.mean(sorted(curve.values())[-5:])) for curve in curves(results, checkpoints, tasks).values()]
-        lines.append(f"| mean, best 5 checkpoints | {mean_interval(best)}{' |' * len(columns)} {of_paper}")
+        best = [
+            float(np.mean(sorted(curve.values())[-5:]))
+            for curve in curves(results, checkpoints, tasks).values()
+        ]
+        lines.append(
+            f"| mean, best 5 checkpoints | {mean_interval(best)}{' |' * len(columns)} {of_paper}"
+        )
     return "\n".join(lines)
 
 
 def ablation_table(results: dict) -> str:
-    """A row a variant: what is different in it, and its means over the base and over the novel tasks."""
+    """A row a variant: what is different in it, and its means over the base and over the novel
+    tasks.
+    """
     lines = ["| outer steps | variant | base | novel |", "|---|---|---|---|"]
     for title, reports in ABLATIONS:
         measured = successes(results, reports)
-        (steps,) = {results["trainings"][label.split("/")[0]]["arguments"]["steps"] for label in measured}
+        (steps,) = {
+            results["trainings"][label.split("/")[0]]["arguments"]["steps"] for label in measured
+        }
         cells = [mean_of_runs(list(measured.values()), tasks) for tasks in (BASE, NOVEL)]
         lines.append(f"| {steps} | {title} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
+def means_table(results: dict) -> str:
+    """The two means, ours and the paper's."""
+    paper = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
+    rows = {
+        "base tasks": (BASE, SEEDS, "base"),
+        "novel tasks": (NOVEL, SEEDS, "novel"),
+        "novel tasks, 1000 steps": (NOVEL, NOVEL_COLUMNS["with 1000 steps"], "novel"),
+    }
+    lines = ["| ML10 | `small` | paper, DP3 | paper, DAMI |", "|---|---|---|---|"]
+    for title, (tasks, reports, split) in rows.items():
+        ours = mean_of_runs(list(successes(results, reports).values()), tasks)
+        theirs = [np.mean([paper[split][task][row] for task in tasks]) for row in ("DP3", "DAMI")]
+        lines.append(f"| {title} | {ours} | {theirs[0]:.1f} | {theirs[1]:.1f} |")
+    return "\n".join(lines)
+
+
 TABLES = {
+    "means": means_table,
     "base": lambda results: seeds_table(results, BASE, BASE_COLUMNS, CHECKPOINTS),
     "novel": lambda results: seeds_table(results, NOVEL, NOVEL_COLUMNS),
     "ablations": ablation_table,
 }
 
 
-def fill(readme: str, results: dict) -> str:
-    """The README with each table between its two comments as RESULTS.json has it."""
+def fill(text: str, results: dict) -> str:
+    """README or RESULTS.md with each table between its two comments as RESULTS.json has it."""
     for name, table in TABLES.items():
         pattern = rf"(<!-- results: {name} -->\n).*?(<!-- end -->)"
-        readme = re.sub(
-            pattern, lambda match, table=table: f"{match[1]}{table(results)}\n{match[2]}", readme, flags=re.S
-        )
-    return readme
+        if found := re.search(pattern, text, flags=re.S):
+            text = text.replace(found[0], f"{found[1]}{table(results)}\n{found[2]}")
+    return text
 
 
 def draw(results: dict) -> None:
@@ -152,41 +216,78 @@ def draw(results: dict) -> None:
     figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
     for run, curve in curves(results, CHECKPOINTS, BASE).items():
         arguments = results["trainings"][run]["arguments"]
-        axes.plot(*zip(*sorted(curve.items())), "o-", markersize=3, linewidth=1, label=f"seed {arguments['seed']}")
-    axes.axvline(arguments["steps"] * arguments["multi_task_share"], color="0.7", linestyle=":", label="MAML begins")
+        axes.plot(
+            *zip(*sorted(curve.items())),
+            "o-",
+            markersize=3,
+            linewidth=1,
+            label=f"seed {arguments['seed']}",
+        )
+    axes.axvline(
+        arguments["steps"] * arguments["multi_task_share"],
+        color="0.7",
+        linestyle=":",
+        label="MAML begins",
+    )
     axes.set(xlabel="outer step", ylabel="mean success on base tasks, %", ylim=(0, 100))
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
-    write_atomically(ROOT / "assets" / "learning-curve.png", lambda path: figure.savefig(path, dpi=110, format="png"))
+    write_atomically(
+        ROOT / "assets" / "learning-curve.png",
+        lambda path: figure.savefig(path, dpi=110, format="png"),
+    )
     plt.close(figure)
 
     figure, axes = plt.subplots(figsize=(9, 3.4), layout="constrained")
     tasks = BASE + NOVEL
     runs = list(successes(results, SEEDS).values())
-    rates = np.array([[100 * np.mean(run[task]) for task in tasks] for run in runs])  # (seeds, tasks)
+    rates = np.array(
+        [[100 * np.mean(run[task]) for task in tasks] for run in runs]
+    )  # (seeds, tasks)
     x = np.arange(len(tasks)) + 0.5 * (np.arange(len(tasks)) >= len(BASE))
     axes.bar(x - 0.2, rates.mean(0), 0.4, color="C0", label=f"small, mean of {len(runs)} seeds")
-    axes.plot(np.tile(x - 0.2, len(runs)), rates.ravel(), ".", color="k", markersize=4, label="each seed")
-    axes.bar(x + 0.2, [paper_success("ml10", task) for task in tasks], 0.4, color="0.75", label="paper (GPU, 258 M)")
+    axes.plot(
+        np.tile(x - 0.2, len(runs)), rates.ravel(), ".", color="k", markersize=4, label="each seed"
+    )
+    axes.bar(
+        x + 0.2,
+        [paper_success("ml10", task) for task in tasks],
+        0.4,
+        color="0.75",
+        label="paper (on a GPU)",
+    )
     axes.set_xticks(x, tasks, rotation=35, ha="right")
     axes.set(ylabel="success, %", ylim=(0, 105))
     axes.set_title("base tasks directly, novel tasks (right) after 200 steps", fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(frameon=False, ncols=3, loc="outside upper center", fontsize=8)
-    write_atomically(ROOT / "assets" / "success.png", lambda path: figure.savefig(path, dpi=110, format="png"))
+    write_atomically(
+        ROOT / "assets" / "success.png", lambda path: figure.savefig(path, dpi=110, format="png")
+    )
     plt.close(figure)
 
 
+def ship(checkpoint: str) -> None:
+    """Writes assets/ml10-small.pt: a checkpoint of train.py, its weights as float16."""
+    policy, info = load_checkpoint(checkpoint)
+    kept = {name: info[name] for name in TRAINED}
+    save_checkpoint(SHIPPED_CHECKPOINT, policy, half=True, **kept)
+
+
 def main(folders: list[str]) -> None:
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"trainings": {}, "evaluations": {}}
+    if folders[:1] == ["--ship"]:
+        return ship(folders[1])
+    empty = {"trainings": {}, "evaluations": {}}
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else empty
     for folder in folders:
         take(results, Path(folder))
     if folders:
-        write_atomically(RESULTS, lambda path: path.write_text(json.dumps(results, indent=1) + "\n"))
+        text = json.dumps(results, indent=1) + "\n"
+        write_atomically(RESULTS, lambda path: path.write_text(text))
         return
-    readme = ROOT / "README.md"
-    filled = fill(readme.read_text(), results)
-    write_atomically(readme, lambda path: path.write_text(filled))
+    for name in ("README.md", "RESULTS.md"):
+        filled = fill((ROOT / name).read_text(), results)
+        write_atomically(ROOT / name, lambda path, filled=filled: path.write_text(filled))
     draw(results)
 
 

@@ -1,4 +1,4 @@
-"""Tests of maml.py against finite differences, torch.optim, a closed form, and on the real (tiny) policy."""
+"""Tests of maml.py against finite differences, torch.optim, a closed form, on the tiny policy."""
 
 import math
 from dataclasses import replace
@@ -15,11 +15,13 @@ from model import PRESETS, DAMIPolicy
 
 
 class Setting:
-    """The tiny policy in float64, its loss as a function of its parameters, and three tasks of random windows."""
+    """The tiny policy in float64, its loss as a function, and three tasks of random windows."""
 
     def __init__(self, **changes):
         torch.manual_seed(0)
-        self.policy = DAMIPolicy(replace(PRESETS["tiny"], num_points=16, demo_positions=4, **changes)).double()
+        self.policy = DAMIPolicy(
+            replace(PRESETS["tiny"], num_points=16, demo_positions=4, **changes)
+        ).double()
         self.params = dict(self.policy.named_parameters())
         self.tasks = [(self.batch(2 * i, 4), self.batch(2 * i + 1, 6)) for i in range(3)]
 
@@ -57,7 +59,7 @@ def unflat(vector, like):
 
 
 def objective(setting, vector, lr, steps):
-    """The mean query loss after adaptation, by plain autograd: no torch.func, no graph through the inner loop."""
+    """The mean query loss after adaptation, by plain autograd, without torch.func."""
     total = 0.0
     for support, query in setting.tasks:
         params = unflat(vector, setting.params)
@@ -70,7 +72,7 @@ def objective(setting, vector, lr, steps):
     return total
 
 
-# --- The gradient through the inner loop -----------------------------------------------------------------------------
+# ---- The gradient through the inner loop ---------------------------------------------------------
 
 
 @pytest.mark.parametrize("steps, lr", [(1, 0.3), (3, 0.1)])
@@ -78,7 +80,11 @@ def objective(setting, vector, lr, steps):
 def test_the_meta_gradient_of_the_policy_equals_finite_differences_and_first_order_does_not(
     setting, steps, lr, vectorize
 ):
-    run = lambda **options: flat(meta_gradient(setting.loss, setting.params, setting.tasks, lr, steps, **options)[0])  # noqa: E731
+
+    def run(**options):
+        tasks = setting.tasks
+        return flat(meta_gradient(setting.loss, setting.params, tasks, lr, steps, **options)[0])
+
     second, first = run(vectorize=vectorize), run(first_order=True, vectorize=vectorize)
     start = flat(setting.params)
     torch.manual_seed(1)
@@ -115,7 +121,9 @@ def test_the_meta_gradient_of_quadratics_has_its_closed_form(steps, vectorize):
         second += jacobian.T @ (c @ adapted - d) / 3
         losses.append(0.5 * adapted @ c @ adapted - d @ adapted)
     for expected, first_order in ((second, False), (first, True)):
-        gradient, values = meta_gradient(loss, {"x": theta}, tasks, lr, steps, first_order, vectorize)
+        gradient, values = meta_gradient(
+            loss, {"x": theta}, tasks, lr, steps, first_order, vectorize
+        )
         torch.testing.assert_close(gradient["x"], expected)
         torch.testing.assert_close(values, torch.stack(losses))
     assert (second - first).norm() > 0.1 * first.norm()
@@ -125,7 +133,9 @@ def test_the_meta_gradient_of_quadratics_has_its_closed_form(steps, vectorize):
 @pytest.mark.parametrize("steps", [1, 2])
 def test_one_task_after_another_equals_all_tasks_under_vmap(setting, steps, first_order):
     runs = [
-        meta_gradient(setting.loss, setting.params, setting.tasks, 0.1, steps, first_order, vectorize)
+        meta_gradient(
+            setting.loss, setting.params, setting.tasks, 0.1, steps, first_order, vectorize
+        )
         for vectorize in (1, 2)
     ]
     (loop, losses), (vectorized, values) = runs
@@ -137,9 +147,13 @@ def test_one_task_after_another_equals_all_tasks_under_vmap(setting, steps, firs
 
 
 def test_first_order_is_the_query_gradient_at_the_adapted_parameters(setting):
-    gradient, _ = meta_gradient(setting.loss, setting.params, setting.tasks[:1], 0.1, 2, first_order=True)
+    gradient, _ = meta_gradient(
+        setting.loss, setting.params, setting.tasks[:1], 0.1, 2, first_order=True
+    )
     support, query = setting.tasks[0]
-    adapted = {name: p.detach() for name, p in adapt(setting.loss, setting.params, support, 0.1, 2).items()}
+    adapted = {
+        name: p.detach() for name, p in adapt(setting.loss, setting.params, support, 0.1, 2).items()
+    }
     torch.testing.assert_close(flat(gradient), flat(grad(setting.loss)(adapted, query)))
 
 
@@ -163,7 +177,11 @@ def test_without_tasks_there_is_no_meta_gradient():
     for vectorize in (1, 2):
         with pytest.raises(ValueError, match="at least one task"):
             meta_gradient(
-                lambda params, batch: params["x"].sum(), {"x": torch.ones(1)}, iter([]), 0.1, vectorize=vectorize
+                lambda params, batch: params["x"].sum(),
+                {"x": torch.ones(1)},
+                iter([]),
+                0.1,
+                vectorize=vectorize,
             )
 
 
@@ -182,11 +200,11 @@ def test_as_many_tasks_run_at_once_as_asked_for(vectorize, chunks):
         meta_gradient(loss, {"x": torch.zeros(1)}, tasks, 0.1, vectorize=0)
 
 
-# --- Memory ----------------------------------------------------------------------------------------------------------
+# ---- Memory --------------------------------------------------------------------------------------
 
 
 class Storages(TorchDispatchMode):
-    """Keeps account of the memory behind every tensor that any operation makes, the ones only autograd holds too."""
+    """Keeps account of the memory behind every tensor that any operation makes."""
 
     def __init__(self):
         super().__init__()
@@ -196,7 +214,9 @@ class Storages(TorchDispatchMode):
         out = func(*args, **(kwargs or {}))
         for x in tree_leaves(out):
             if isinstance(x, torch.Tensor):
-                self.made.append((StorageWeakRef(x.untyped_storage()), x.untyped_storage().nbytes()))
+                self.made.append(
+                    (StorageWeakRef(x.untyped_storage()), x.untyped_storage().nbytes())
+                )
         return out
 
     def alive(self):
@@ -217,13 +237,17 @@ def test_memory_does_not_grow_with_the_number_of_tasks(setting, vectorize):
         _, losses = meta_gradient(setting.loss, setting.params, tasks(), 0.1, vectorize=vectorize)
     assert len(losses) == 5 * vectorize and max(size for _, size in storages.made) > 1000
     parameters = sum(p.numel() for p in setting.params.values()) * 8
-    assert max(alive) < 3.5 * parameters  # the sum, one task's gradients, one task's batch; no graph
+    assert (
+        max(alive) < 3.5 * parameters
+    )  # the sum, one task's gradients, one task's batch; no graph
     assert max(alive[3:]) - alive[2] < 0.02 * parameters
 
 
 def test_the_result_carries_no_graph_although_the_parameters_require_grad(setting):
     for vectorize in (1, 2):
-        gradients, losses = meta_gradient(setting.loss, setting.params, setting.tasks, 0.1, vectorize=vectorize)
+        gradients, losses = meta_gradient(
+            setting.loss, setting.params, setting.tasks, 0.1, vectorize=vectorize
+        )
         assert all(p.requires_grad for p in setting.params.values())
         assert not losses.requires_grad and not any(g.requires_grad for g in gradients.values())
     assert math.isfinite(losses.sum())

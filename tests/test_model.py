@@ -1,7 +1,8 @@
-"""Tests of model.py (its CLIP part is in test_clip.py) against diffusers, naive computations and real demonstrations."""
+"""Tests of model.py against diffusers, a textbook's DP3, and real demonstrations."""
 
 import ast
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +13,11 @@ from diffusers.models.embeddings import get_timestep_embedding
 
 import data
 import model
-from evaluate import window_sampler
 from model import (
     PRESETS,
     Conv1d,
     DAMIPolicy,
     DiffusionSchedule,
-    InputError,
     Normalizer,
     PointNetEncoder,
     PolicyConfig,
@@ -27,8 +26,30 @@ from model import (
 from tests.textbook import TextbookDP3
 
 TINY = PRESETS["tiny"]
-BATCH = ("points", "state", "action", "noise", "timesteps")  # what a policy reads that knows no task
-ABLATIONS = [("vmt", "down"), ("vmt", "mid"), ("vmt", "up"), ("mlp", "down"), ("none", "down"), ("none", "none")]
+BATCH = (
+    "points",
+    "state",
+    "action",
+    "noise",
+    "timesteps",
+)  # what a policy reads that knows no task
+ABLATIONS = [("vmt", "down"), ("vmt", "mid"), ("vmt", "up"), ("mlp", "down"), ("none", "down")]
+ABLATIONS += [("mlp", "none"), ("vmt", "none"), ("none", "none")]
+
+
+ROOT = Path(model.__file__).parent
+OURS = [path.stem for path in ROOT.glob("*.py")]
+
+
+def imports(path):
+    """The top-level names of all modules that a file imports, wherever in it."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(node.module.split(".")[0] if node.level == 0 else "tests")
+    return names
 
 
 def new_policy(seed=0, **changes):
@@ -54,15 +75,19 @@ def random_batch(config, windows=6, tasks=1, frames=10, seed=0):
 
 
 def context_of(policy, batch, task=slice(None)):
-    return policy.encode_demo(*(batch[name][task] for name in ("text", "demo_points", "demo_state", "demo_action")))
+    return policy.encode_demo(
+        *(batch[name][task] for name in ("text", "demo_points", "demo_state", "demo_action"))
+    )
 
 
 def sample(policy, batch, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    return policy.sample_actions(batch["points"], batch["state"], context_of(policy, batch), generator)
+    return policy.sample_actions(
+        batch["points"], batch["state"], context_of(policy, batch), generator
+    )
 
 
-# --- Configuration ---------------------------------------------------------------------------------------------------
+# ---- Configuration -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -73,14 +98,13 @@ def sample(policy, batch, seed=0):
         ({"inference_steps": 7}, ("100", "7")),
         ({"demo_dim": 130}, ("130", "4")),
         ({"u2t_heads": 7}, ("384", "7")),
-        ({"unet_widths": (512, 1020, 2048)}, ("1020", "8")),
-        ({"tcfm": "none"}, ("tcfm", "demo_encoder")),
+        ({"unet_widths": (512, 1020, 2048)}, ("4", "8")),
         ({"demo_encoder": "lstm"}, ("lstm", "vmt")),
         ({"tcfm": "left"}, ("left", "mid")),
     ],
 )
 def test_a_config_that_contradicts_itself_is_refused_naming_both_values(changes, numbers):
-    with pytest.raises(InputError) as error:
+    with pytest.raises(ValueError) as error:
         PolicyConfig(**changes)
     assert all(number in str(error.value) for number in numbers) and "\n" not in str(error.value)
 
@@ -105,20 +129,29 @@ def test_every_parameter_has_one_adaptation_learning_rate_and_a_gradient(demo_en
     assert without == []
 
 
-@pytest.mark.parametrize("name", ["model", "maml", "data"])
+@pytest.mark.parametrize("name", ["model", "clip", "maml", "data"])
 def test_a_module_made_to_be_copied_imports_nothing_from_the_project(name):
-    root = Path(model.__file__).parent
-    ours = {path.stem for path in root.glob("*.py")} | {"tests"}
-    imported = set()
-    for node in ast.walk(ast.parse((root / f"{name}.py").read_text())):
-        if isinstance(node, ast.Import):
-            imported |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            imported.add(node.module.split(".")[0] if node.level == 0 else "tests")
-    assert "torch" in imported and not imported & ours
+    imported = imports(ROOT / f"{name}.py")
+    assert "torch" in imported and not imported & {*OURS, "tests"}
 
 
-# --- Diffusion -------------------------------------------------------------------------------------------------------
+def test_no_two_files_import_each_other_and_the_robot_needs_no_simulator():
+    graph = {name: imports(ROOT / f"{name}.py") & set(OURS) for name in OURS}
+    while leaves := [name for name, needed in graph.items() if not needed]:
+        for leaf in leaves:
+            del graph[leaf]
+        graph = {name: needed - set(leaves) for name, needed in graph.items()}
+    assert graph == {}, f"a cycle among {sorted(graph)}"
+
+    needed, waiting = set(), ["robot"]
+    while waiting:
+        found = imports(ROOT / f"{waiting.pop()}.py") & set(OURS)
+        waiting += found - needed
+        needed |= found
+    assert "data" in needed and not needed & {"simulator", "evaluate"}
+
+
+# ---- Diffusion -----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -141,7 +174,9 @@ def test_noising_equals_that_of_diffusers_at_every_step(peer):
     schedule, every = DiffusionSchedule(), torch.arange(100)
     clean, noise = torch.randn(2, 100, 16, 4, generator=torch.Generator().manual_seed(0))
     expected = peer.add_noise(clean, noise, every)
-    torch.testing.assert_close(schedule.add_noise(clean, noise, every), expected, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(
+        schedule.add_noise(clean, noise, every), expected, atol=1e-6, rtol=1e-6
+    )
 
 
 def test_sampling_equals_a_full_run_of_diffusers(peer):
@@ -183,7 +218,11 @@ def test_the_timestep_embedding_equals_that_of_diffusers():
 def test_sampling_is_repeatable_from_a_seed_and_shaped_as_an_action_chunk():
     policy = new_policy()
     batch = random_batch(policy.config, windows=5)
-    first, again, other = sample(policy, batch), sample(policy, batch), sample(policy, batch, seed=1)
+    first, again, other = (
+        sample(policy, batch),
+        sample(policy, batch),
+        sample(policy, batch, seed=1),
+    )
     assert first.shape == (5, 8, 4)
     assert torch.equal(first, again) and not torch.allclose(first, other, atol=1e-2)
 
@@ -197,7 +236,7 @@ def test_loss_is_a_pure_function_of_its_arguments_and_random_without_them():
         assert not torch.equal(policy.loss(**without), policy.loss(**without))
 
 
-# --- The task: demonstration and instruction -------------------------------------------------------------------------
+# ---- The task: demonstration and instruction -----------------------------------------------------
 
 
 @pytest.mark.parametrize("tasks, windows", [(1, 1), (1, 5), (3, 6)])
@@ -213,7 +252,10 @@ def test_the_shared_key_path_of_u2t_equals_the_full_sequence_with_its_gradients(
     fused = u2t(h, u2t.encode_context(demo, text))
     naive = u2t.full_sequence(h, u2t.embed(demo, text).repeat_interleave(windows // tasks, dim=0))
     torch.testing.assert_close(fused, naive, atol=1e-6, rtol=0)
-    both = [torch.autograd.grad((x * weights).sum(), [*inputs, *u2t.parameters()]) for x in (fused, naive)]
+    both = [
+        torch.autograd.grad((x * weights).sum(), [*inputs, *u2t.parameters()])
+        for x in (fused, naive)
+    ]
     for shared, full in zip(*both):
         assert full.abs().max() > 0
         torch.testing.assert_close(shared, full, atol=1e-6, rtol=0)
@@ -225,7 +267,10 @@ def test_the_loss_of_three_tasks_is_the_mean_of_their_losses(layers):
     batch = random_batch(policy.config, windows=6, tasks=3)
     losses = [
         policy.loss(
-            **{name: x[i : i + 1] if len(x) == 3 else x[2 * i : 2 * i + 2] for name, x in batch.items()},
+            **{
+                name: x[i : i + 1] if len(x) == 3 else x[2 * i : 2 * i + 2]
+                for name, x in batch.items()
+            }
         )
         for i in range(3)
     ]
@@ -237,27 +282,39 @@ def test_a_context_computed_once_serves_every_window_and_step():
     policy = new_policy()
     batch = random_batch(policy.config, windows=4)
     context = context_of(policy, batch)
-    repeated = policy.encode_demo(*(batch[n].repeat_interleave(4, 0) for n in batch if n.startswith(("text", "demo"))))
+    repeated = policy.encode_demo(
+        *(batch[n].repeat_interleave(4, 0) for n in batch if n.startswith(("text", "demo")))
+    )
     for again in (context_of(policy, batch), repeated):
         draws = [
-            policy.sample_actions(batch["points"], batch["state"], c, torch.Generator().manual_seed(0))
+            policy.sample_actions(
+                batch["points"], batch["state"], c, torch.Generator().manual_seed(0)
+            )
             for c in (context, again)
         ]
         torch.testing.assert_close(*draws, atol=1e-5, rtol=0)
 
 
 def test_vmt_reads_the_order_of_frames_and_its_mlp_ablation_does_not():
-    features, actions = torch.randn(2, 10, TINY.observation_feature_dim), torch.randn(2, 10, TINY.action_dim)
+    features, actions = (
+        torch.randn(2, 10, TINY.observation_feature_dim),
+        torch.randn(2, 10, TINY.action_dim),
+    )
     vmt = new_policy().demo_encoder
-    reversed_tokens = vmt(features.flip(1), actions.flip(1)).flip(1)  # equal if only the frames, not their times, count
+    reversed_tokens = vmt(features.flip(1), actions.flip(1)).flip(
+        1
+    )  # equal if only the frames, not their times, count
     assert (vmt(features, actions) - reversed_tokens).abs().max() > 1e-2
     mlp = new_policy(demo_encoder="mlp").demo_encoder
-    torch.testing.assert_close(mlp(features, actions), mlp(features.flip(1), actions.flip(1)), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        mlp(features, actions), mlp(features.flip(1), actions.flip(1)), atol=1e-6, rtol=0
+    )
 
 
+@pytest.mark.parametrize("demo_encoder, tcfm", [("vmt", "down"), ("mlp", "none"), ("vmt", "none")])
 @pytest.mark.parametrize("name", ["text", "demo_points", "demo_state", "demo_action"])
-def test_every_part_of_the_task_reaches_the_actions(name):
-    policy = new_policy()
+def test_every_part_of_the_task_reaches_the_actions(name, demo_encoder, tcfm):
+    policy = new_policy(demo_encoder=demo_encoder, tcfm=tcfm)
     batch = random_batch(policy.config)
     other = batch | {name: random_batch(policy.config, seed=1)[name]}
     assert (sample(policy, batch) - sample(policy, other)).abs().max() > 1e-4
@@ -295,18 +352,27 @@ def test_only_the_points_that_win_a_channel_are_differentiated_and_none_of_them_
 
 def test_the_policy_without_a_demonstration_is_the_textbooks_dp3():
     policy = new_policy(demo_encoder="none", tcfm="none")
+    assert not list(policy.unet.condition_mlp.parameters())  # Eq. 7's MLP is DAMI's
     textbook = TextbookDP3(policy.config)
     textbook.load_state_dict(policy.state_dict())
-    batch = {name: x for name, x in random_batch(policy.config, windows=20).items() if name in BATCH}
+    batch = {
+        name: x for name, x in random_batch(policy.config, windows=20).items() if name in BATCH
+    }
     losses = policy.loss(**batch), textbook.loss(**batch)
     torch.testing.assert_close(*losses, rtol=1e-5, atol=0)
-    gradients = [torch.autograd.grad(loss, list(p.parameters())) for loss, p in zip(losses, (policy, textbook))]
+    gradients = [
+        torch.autograd.grad(loss, list(p.parameters()))
+        for loss, p in zip(losses, (policy, textbook))
+    ]
     torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-6)
 
 
 def test_a_wide_convolution_written_as_a_matrix_product_is_a_convolution():
     torch.manual_seed(0)
-    ours, torchs = Conv1d(1024, 1024, 5).double(), torch.nn.Conv1d(1024, 1024, 5, padding=2).double()
+    ours, torchs = (
+        Conv1d(1024, 1024, 5).double(),
+        torch.nn.Conv1d(1024, 1024, 5, padding=2).double(),
+    )
     assert ours.wide and not Conv1d(64, 64, 5).wide
     torchs.load_state_dict(ours.state_dict())
     x = torch.randn(2, 1024, 4, dtype=torch.float64, requires_grad=True)
@@ -314,34 +380,45 @@ def test_a_wide_convolution_written_as_a_matrix_product_is_a_convolution():
     torch.testing.assert_close(*results)
     cotangent = torch.randn_like(results[0])
     torch.testing.assert_close(
-        *(torch.autograd.grad(y, [x, *layer.parameters()], cotangent) for y, layer in zip(results, (ours, torchs)))
+        *(
+            torch.autograd.grad(y, [x, *layer.parameters()], cotangent)
+            for y, layer in zip(results, (ours, torchs))
+        )
     )
 
 
 def test_a_demonstration_longer_than_the_positions_is_refused_with_both_numbers():
     policy = new_policy()
-    with pytest.raises(InputError, match=r"11 frames.* 10 positions"):
+    with pytest.raises(ValueError, match=r"11 frames.* 10 positions"):
         context_of(policy, random_batch(policy.config, frames=11))
 
 
 @pytest.mark.parametrize("tcfm", ["down", "mid", "up", "none"])
 def test_u2t_conditions_the_two_blocks_of_the_named_level_and_h_all_others(tcfm):
-    policy = new_policy(tcfm=tcfm, demo_encoder="none" if tcfm == "none" else "vmt", unet_widths=(16, 32, 64))
+    policy = new_policy(
+        tcfm=tcfm, demo_encoder="none" if tcfm == "none" else "vmt", unet_widths=(16, 32, 64)
+    )
     unet = policy.unet
     levels = {"down": unet.down[0][:2], "mid": unet.mid, "up": unet.up[-1][:2], "none": []}
     h, fused = torch.randn(2, 2, policy.config.condition_dim)
     read = {}
     for name, module in unet.named_modules():
         if isinstance(module, model.ResidualBlock):
-            module.register_forward_pre_hook(lambda _, args, name=name: read.update({name: args[1]}))
+            module.register_forward_pre_hook(
+                lambda _, args, name=name: read.update({name: args[1]})
+            )
     unet(torch.randn(2, 16, 4), h, None if tcfm == "none" else fused)
-    named = {name for name, module in unet.named_modules() if any(module is block for block in levels[tcfm])}
+    named = {
+        name
+        for name, module in unet.named_modules()
+        if any(module is block for block in levels[tcfm])
+    }
     assert len(read) == 12 and len(named) == (0 if tcfm == "none" else 2)
     assert {name for name, condition in read.items() if condition is fused} == named
     assert all(condition is h for name, condition in read.items() if name not in named)
 
 
-# --- Normalization and moving average --------------------------------------------------------------------------------
+# ---- Normalization and moving average ------------------------------------------------------------
 
 
 def test_the_normalizer_maps_the_data_onto_minus_one_to_one_and_back():
@@ -357,8 +434,12 @@ def test_the_normalizer_maps_the_data_onto_minus_one_to_one_and_back():
         moving = slice(0, 1) if name == "state" else slice(None)
         torch.testing.assert_close(low[moving], -torch.ones_like(low[moving]))
         torch.testing.assert_close(high[moving], torch.ones_like(high[moving]))
-    assert normalizer.normalize("state", state)[:, 1:].abs().max() < 1e-5  # neither stretched nor divided by zero
-    torch.testing.assert_close(normalizer.normalize("state", torch.tensor([0.0, 0.9, 0.3]))[1], torch.tensor(0.2))
+    assert (
+        normalizer.normalize("state", state)[:, 1:].abs().max() < 1e-5
+    )  # neither stretched nor divided by zero
+    torch.testing.assert_close(
+        normalizer.normalize("state", torch.tensor([0.0, 0.9, 0.3]))[1], torch.tensor(0.2)
+    )
     action[:, 1] = 0.4
     normalizer.fit(points, state, action)
     drawn = normalizer.unnormalize("action", torch.tensor([[-1.0, -1.0], [1.0, 1.0]]))
@@ -384,20 +465,20 @@ def test_the_moving_average_follows_the_papers_decay():
     assert ema.module.get_parameter("unet.head.1.bias")[0].item() == pytest.approx(1e-4, rel=1e-3)
 
 
-# --- Learning from real Meta-World -----------------------------------------------------------------------------------
+# ---- Learning from real Meta-World ---------------------------------------------------------------
 
 
 def test_the_policy_overfits_one_real_window_batch_and_samples_its_actions(recorded):
     policy = new_policy().train()
     demonstrations = data.load_demonstrations(recorded / "reach.npz")
-    sampler = window_sampler(policy, demonstrations)
+    sampler = data.WindowSampler(demonstrations, policy.config)
     policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
     generator = torch.Generator().manual_seed(0)
     batch = sampler.batch(8, generator) | {"text": torch.randn(1, 512, generator=generator)}
     optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
     losses = []
     for _ in range(150):
-        loss = policy.loss(**batch, **policy.draw_noise(8, generator))
+        loss = policy.loss(**batch, **policy.draw_noise_and_timesteps(8, generator))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -411,17 +492,23 @@ def test_the_policy_overfits_one_real_window_batch_and_samples_its_actions(recor
     assert (drawn - wanted).abs().mean() < 0.25 * spread
 
 
-# --- Checkpoints -----------------------------------------------------------------------------------------------------
+# ---- Checkpoints ---------------------------------------------------------------------------------
 
 
 def test_a_checkpoint_gives_back_policy_normalizer_and_information(tmp_path):
     policy = new_policy(demo_encoder="mlp", tcfm="up")
     batch = random_batch(policy.config)
     policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
-    model.save_checkpoint(tmp_path / "a.pt", policy, step=7, text_weights="random-seed-0", arguments={"lr": 1e-3})
+    model.save_checkpoint(
+        tmp_path / "a.pt", policy, step=7, text_weights="random-seed-0", arguments={"lr": 1e-3}
+    )
     again, info = model.load_checkpoint(tmp_path / "a.pt")
     assert again.config == policy.config and not again.training
-    assert info["step"] == 7 and info["text_weights"] == "random-seed-0" and info["arguments"] == {"lr": 1e-3}
+    assert (
+        info["step"] == 7
+        and info["text_weights"] == "random-seed-0"
+        and info["arguments"] == {"lr": 1e-3}
+    )
     assert torch.equal(sample(again, batch), sample(policy, batch))
     assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
 
@@ -435,14 +522,21 @@ def test_a_half_precision_checkpoint_is_half_as_large_and_acts_nearly_alike(tmp_
     again, _ = model.load_checkpoint(tmp_path / "half.pt")
     assert (tmp_path / "half.pt").stat().st_size < 0.6 * (tmp_path / "whole.pt").stat().st_size
     assert all(x.dtype == torch.float32 for x in again.state_dict().values())
-    assert all(torch.equal(a, b) for a, b in zip(again.normalizer.buffers(), policy.normalizer.buffers()))
+    assert all(
+        torch.equal(a, b) for a, b in zip(again.normalizer.buffers(), policy.normalizer.buffers())
+    )
     torch.testing.assert_close(sample(again, batch), sample(policy, batch), atol=0.02, rtol=0)
 
 
 def bad_checkpoints(folder, good):
     """Path -> what the message must say."""
     raw = good.read_bytes()
-    files = {"missing": None, "truncated": raw[: len(raw) // 2], "empty": b"", "text": b"not a checkpoint"}
+    files = {
+        "missing": None,
+        "truncated": raw[: len(raw) // 2],
+        "empty": b"",
+        "text": b"not a checkpoint",
+    }
     for name, content in files.items():
         if content is not None:
             (folder / name).write_bytes(content)
@@ -455,12 +549,12 @@ def bad_checkpoints(folder, good):
     torch.save({name: x for name, x in info.items() if name != "model"}, folder / "headless")
     return {
         "missing": "no checkpoint at",
-        "truncated": "damaged or not a PyTorch checkpoint",
-        "empty": "damaged or not a PyTorch checkpoint",
-        "text": "damaged or not a PyTorch checkpoint",
-        "pickled": "damaged or not a PyTorch checkpoint",
-        "foreign": "is not a 'DAMI checkpoint 1' file",
-        "list": "is not a 'DAMI checkpoint 1' file",
+        "truncated": "damaged or no PyTorch checkpoint",
+        "empty": "damaged or no PyTorch checkpoint",
+        "text": "damaged or no PyTorch checkpoint",
+        "pickled": "damaged or no PyTorch checkpoint",
+        "foreign": "is not a file of train.py or finetune.py",
+        "list": "is not a file of train.py or finetune.py",
         "shape": "do not fit",
         "newer": "flavor",
         "headless": "do not fit",
@@ -470,9 +564,13 @@ def bad_checkpoints(folder, good):
 def test_a_checkpoint_that_cannot_be_used_is_refused_in_one_line(tmp_path):
     model.save_checkpoint(tmp_path / "good.pt", new_policy())
     for name, message in bad_checkpoints(tmp_path, tmp_path / "good.pt").items():
-        with pytest.raises(InputError) as error:
+        with pytest.raises(ValueError) as error:
             model.load_checkpoint(tmp_path / name)
-        assert message in str(error.value) and name in str(error.value) and "\n" not in str(error.value), name
+        assert (
+            message in str(error.value)
+            and name in str(error.value)
+            and "\n" not in str(error.value)
+        ), name
 
 
 def test_a_checkpoint_cannot_run_code(tmp_path):
@@ -481,13 +579,17 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
             return os.mkdir, (str(tmp_path / "ran"),)
 
     torch.save({"format": model.CHECKPOINT_FORMAT, "config": Bomb()}, tmp_path / "bomb.pt")
-    with pytest.raises(InputError):
+    with pytest.raises(ValueError):
         model.load_checkpoint(tmp_path / "bomb.pt")
     assert not (tmp_path / "ran").exists()
 
 
-@pytest.mark.parametrize("failure", [OSError("disk full"), RuntimeError("disk full"), KeyboardInterrupt()])
-def test_a_failing_save_leaves_the_old_checkpoint_and_no_temporary_file(tmp_path, monkeypatch, failure):
+@pytest.mark.parametrize(
+    "failure", [OSError("disk full"), RuntimeError("disk full"), KeyboardInterrupt()]
+)
+def test_a_failing_save_leaves_the_old_checkpoint_and_no_temporary_file(
+    tmp_path, monkeypatch, failure
+):
     model.save_checkpoint(tmp_path / "a.pt", new_policy(), step=1)
 
     def half(_, path):
@@ -501,14 +603,14 @@ def test_a_failing_save_leaves_the_old_checkpoint_and_no_temporary_file(tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
 
 
-# --- python model.py -------------------------------------------------------------------------------------------------
+# ---- python model.py -----------------------------------------------------------------------------
 
 
-def test_the_printed_table_counts_every_preset(capsys):
-    model.main([])
+def test_the_printed_table_counts_every_preset(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["model.py"])
+    model.main()
     printed = capsys.readouterr().out
     for name, config in PRESETS.items():
         with torch.device("meta"):
             count = sum(p.numel() for p in DAMIPolicy(config).parameters())
-        assert f"{name}: {count:,} trainable parameters" in printed
-    assert "CLIP text tower" in printed
+        assert re.search(rf"^{name} +{count:,}$", printed, re.M)

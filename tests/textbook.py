@@ -1,7 +1,8 @@
-"""DP3 as a textbook would write it: what our policy without a demonstration is compared with, in numbers and in time.
+"""DP3 as a textbook would write it: what our policy without a demonstration is compared with.
 
-PyTorch's own layers, every point through the differentiated PointNet, `diffusers` for the noise, an optimizer with its
-defaults, a moving average parameter by parameter. Names of parameters are ours, so that our weights can be loaded.
+PyTorch's own layers, every point through the differentiated PointNet, `diffusers` for the noise, an
+optimizer with its defaults, a moving average parameter by parameter. Names of parameters are ours,
+so that our weights can be loaded.
 """
 
 import torch
@@ -31,7 +32,9 @@ class ObservationEncoder(nn.Module):
         super().__init__()
         self.pointnet = PointNet(config.pointnet_widths, config.point_feature_dim)
         width = config.state_feature_dim
-        self.state_mlp = nn.Sequential(nn.Linear(config.state_dim, width), nn.ReLU(), nn.Linear(width, width))
+        self.state_mlp = nn.Sequential(
+            nn.Linear(config.state_dim, width), nn.ReLU(), nn.Linear(width, width)
+        )
 
     def forward(self, points, state):
         return torch.cat([self.pointnet(points), self.state_mlp(state)], dim=-1)
@@ -59,14 +62,18 @@ class UNet(nn.Module):
     def __init__(self, config):
         super().__init__()
         self.width = width = config.timestep_dim
-        c, levels = config.condition_dim, [config.action_dim, *config.unet_widths]
-        self.timestep_mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        self.condition_mlp = nn.Sequential(nn.Linear(c, c), nn.Mish(), nn.Linear(c, c))
+        levels = [config.action_dim, *config.unet_widths]
+        self.timestep_mlp = nn.Sequential(
+            nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width)
+        )
         self.down, self.mid, self.up = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
         for i in range(1, len(levels)):
             inside = i < len(levels) - 1
             shrink = nn.Conv1d(levels[i], levels[i], 3, 2, 1) if inside else nn.Identity()
-            first, second = ResidualBlock(levels[i - 1], levels[i], config), ResidualBlock(levels[i], levels[i], config)
+            first, second = (
+                ResidualBlock(levels[i - 1], levels[i], config),
+                ResidualBlock(levels[i], levels[i], config),
+            )
             self.down.append(nn.ModuleList([first, second, shrink]))
         self.mid.extend(ResidualBlock(levels[-1], levels[-1], config) for _ in range(2))
         for i in range(len(levels) - 1, 1, -1):
@@ -75,7 +82,8 @@ class UNet(nn.Module):
             grow = nn.ConvTranspose1d(levels[i - 1], levels[i - 1], 4, 2, 1)
             self.up.append(nn.ModuleList([first, second, grow]))
         self.head = nn.Sequential(
-            conv_block(levels[1], levels[1], config), nn.Conv1d(levels[1], config.action_dim, kernel_size=1)
+            conv_block(levels[1], levels[1], config),
+            nn.Conv1d(levels[1], config.action_dim, kernel_size=1),
         )
 
     def forward(self, noisy, timesteps, observation):
@@ -83,7 +91,7 @@ class UNet(nn.Module):
         rates = 10000 ** (-torch.arange(half) / (half - 1))
         angles = timesteps[:, None] * rates[None]
         step = self.timestep_mlp(torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1))
-        condition = self.condition_mlp(torch.cat([step, observation], dim=-1))
+        condition = torch.cat([step, observation], dim=-1)
         x, kept = noisy.permute(0, 2, 1), []
         for first, second, shrink in self.down:
             x = second(first(x, condition), condition)
@@ -114,7 +122,9 @@ class TextbookDP3(nn.Module):
         return F.mse_loss(self.unet(noisy, timesteps, observation), action)
 
 
-def training_step(policy: TextbookDP3, average: TextbookDP3, optimizer: torch.optim.Optimizer, batch: dict) -> None:
+def training_step(
+    policy: TextbookDP3, average: TextbookDP3, optimizer: torch.optim.Optimizer, batch: dict
+) -> None:
     """One step of plain training: gradient, AdamW, moving average."""
     loss = policy.loss(**batch)
     optimizer.zero_grad()

@@ -1,0 +1,186 @@
+"""Tests of evaluate.py: figures, which checkpoint, rollouts, the policy that ships, bad input."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import fails
+
+import clip
+import data
+import evaluate
+import finetune
+import model
+import simulator
+import train
+
+pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
+
+
+# ---- Figures -------------------------------------------------------------------------------------
+
+
+def test_success_is_written_in_percent_with_its_interval():
+    assert evaluate.format_success(17, 20) == "85.0 [64.0, 94.8]"
+    assert evaluate.format_success(0, 20) == "0.0 [0.0, 16.1]"
+    assert evaluate.mean_success({"a": [True, False], "b": [True, True, True]}) == 75.0
+
+
+def test_the_mean_over_runs_has_students_interval():
+    assert evaluate.mean_interval([50.0]) == "50.0 (one run)"
+    # 4.303 * 10 / sqrt(3)
+    assert evaluate.mean_interval([40.0, 50.0, 60.0]) == "50.0 ± 24.8 (3 runs)"
+
+
+def test_a_table_has_a_row_a_task_the_mean_and_the_papers_figures():
+    successes = {"reach": [True, False], "drawer-close": [True, True]}
+    table = evaluate.success_table({"ours": successes}, "ml10")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+    assert rows[0] == ["task", "ours", "paper"]
+    assert [row[0] for row in rows[2:]] == ["reach", "drawer-close", "**mean**"]
+    assert rows[4][1] == evaluate.format_success(3, 4)
+    paper = [evaluate.paper_success("ml10", task) for task in ("reach", "drawer-close")]
+    assert [row[2] for row in rows[2:]] == [f"{value:.1f}" for value in (*paper, sum(paper) / 2)]
+
+
+# ---- Which checkpoint ----------------------------------------------------------------------------
+
+
+def test_the_default_is_the_newest_finished_run_of_the_suite_that_is_not_tiny(capsys):
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+
+    def leave(name, preset="small", suite="ml10", steps=5, last=5):
+        arguments = {"preset": preset, "suite": suite, "steps": steps}
+        Path(f"runs/{name}").mkdir(parents=True)
+        Path(f"runs/{name}/config.json").write_text(json.dumps({"arguments": arguments}))
+        model.save_checkpoint(f"runs/{name}/ema-{last:05d}.pt", policy)
+
+    leave("a-tiny", preset="tiny")
+    leave("b-unfinished", last=4)
+    leave("c-own", suite="own")
+    assert evaluate.default_checkpoint("ml10") == evaluate.SHIPPED_CHECKPOINT
+    assert "comes with the code" in capsys.readouterr().out
+    leave("d-older")
+    leave("e-newer")
+    assert evaluate.default_checkpoint("ml10") == Path("runs/e-newer/ema-00005.pt")
+    assert evaluate.default_checkpoint("own") == Path("runs/c-own/ema-00005.pt")
+    with pytest.raises(ValueError, match="no finished run on ml45"):
+        evaluate.default_checkpoint("ml45")
+
+
+def test_without_any_policy_the_user_is_told_how_to_make_one(monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "SHIPPED_CHECKPOINT", Path("none.pt"))
+    for script, argv in ((evaluate, []), (finetune, ["--task", "shelf-place"])):
+        assert "no finished run on ml10 in runs/: train one" in fails(script, argv, capsys)
+
+
+# ---- Rollouts ------------------------------------------------------------------------------------
+
+
+def test_the_policy_that_ships_opens_windows(recorded):
+    """Guards it against everything that it depends on: text weights, camera, sampling, layers."""
+    task = "window-open"
+    features, _ = clip.text_features([simulator.INSTRUCTIONS[task]], "random")
+    paths, text = {task: recorded / f"{task}.npz"}, {task: features[0]}
+    successes = evaluate.evaluate(evaluate.SHIPPED_CHECKPOINT, paths, text, 10, 0)[task]
+    assert len(successes) == 10 and sum(successes) >= 8
+
+
+def evaluating(run, recorded, options=""):
+    common = f"--demonstrations 2 --device cpu {options}"
+    return ["--checkpoint", str(run), "--data", str(recorded), *common.split()]
+
+
+def test_evaluating_again_with_other_workers_gives_the_same_episodes(
+    run, recorded, monkeypatch, capsys
+):
+    monkeypatch.setattr(evaluate, "EPISODES_A_JOB", 1)  # as in the run
+    options = "--episodes 2 --workers 1 --top 2 --out report"
+    evaluate.main(evaluating(run, recorded, options))
+    report = json.loads(Path("report/success.json").read_text())
+    trained = json.loads((run / "success.json").read_text())
+    label = "ml10-tiny-seed0/ema-00006"
+    assert report["successes"] == {label: trained["successes"]["last checkpoint"]}
+    assert {"mean, last checkpoint", "mean, best 2 checkpoints"} <= set(report["facts"])
+    assert "best 2 checkpoints" in capsys.readouterr().out
+    message = fails(evaluate, evaluating(run, recorded, options), capsys)
+    assert "already holds success.json: add --overwrite" in message
+
+
+def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recorded, monkeypatch):
+    text = torch.randn(512, generator=torch.Generator().manual_seed(0)).numpy()
+    rollout, frames = evaluate.rollout, []
+
+    def watched(*args):
+        watch = lambda _, observation: frames.append(observation["point_cloud"])  # noqa: E731
+        return rollout(*args[:6], watch)
+
+    class Quiet:
+        def put(self, item):
+            pass
+
+    monkeypatch.setattr(evaluate, "rollout", watched)
+    monkeypatch.setattr(simulator, "EPISODE_STEPS", 40)
+    monkeypatch.setattr(evaluate, "loaded", {})
+    monkeypatch.setattr(evaluate.worker, "finished", Quiet(), raising=False)
+
+    def job(task, episode):
+        frames.clear()
+        seeds = [simulator.evaluation_seed(0, episode)]
+        evaluate.rollout_job(task, str(recorded / f"{task}.npz"), 2, text, seeds)
+        return np.stack(frames)
+
+    evaluate.load_policy(str(run / "ema-00006.pt"), "cpu")
+    alone = job("reach", 1)
+    for task, episode in [("reach", 0), ("drawer-close", 0), ("reach", 1)]:
+        later = job(task, episode)
+    assert len(alone) == 5 and np.array_equal(alone, later)
+
+
+def test_a_rollout_can_be_watched(run, recorded, monkeypatch, capsys):
+    monkeypatch.setattr(simulator, "EPISODE_STEPS", 24)
+    evaluate.main(evaluating(run, recorded, "--task reach --gif reach.gif"))
+    assert Path("reach.gif").read_bytes().startswith(b"GIF8")
+    assert Path("reach.gif").stat().st_size > 10_000
+    assert "wrote reach.gif" in capsys.readouterr().out
+
+
+# ---- Bad input -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ("--checkpoint none.pt", "none.pt"),
+        ("--episodes 0", "--episodes is 0: use at least 1"),
+        ("--gif reach.gif", "name its task"),
+        ("--task reach --gif reach.mp4", "reach.gif"),
+        ("--seed -1", "seed"),
+        ("--task raech", "did you mean 'reach'?"),
+        ("--suite ml-45", "did you mean 'ml45'?"),
+        ("--top 5", "holds 2 checkpoints, fewer than --top"),
+    ],
+)
+def test_a_wrong_argument_ends_in_one_line_that_says_what_to_do(run, options, message, capsys):
+    assert message in fails(evaluate, ["--checkpoint", run, *options.split()], capsys)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA here")
+@pytest.mark.parametrize("script", [train, finetune, evaluate])
+def test_cuda_where_there_is_none_points_to_the_cpu(script, capsys):
+    assert "--device cuda cannot be used here" in fails(script, ["--device", "cuda"], capsys)
+
+
+def test_a_policy_of_own_recordings_cannot_be_rolled_out(run, recorded, capsys):
+    info = torch.load(run / "ema-00006.pt", weights_only=True)
+    torch.save(info | {"suite": "own"}, "own.pt")
+    message = fails(evaluate, ["--checkpoint", "own.pt", "--data", recorded], capsys)
+    assert "no simulator" in message
+
+
+def test_a_command_ends_quietly_or_in_one_line(capsys):
+    with pytest.raises(SystemExit) as end:
+        data.command_line(lambda: (_ for _ in ()).throw(KeyboardInterrupt()))
+    assert end.value.code == 130

@@ -1,0 +1,181 @@
+"""Tests of finetune.py: one task, all novel tasks, own recordings, bad input."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import fails, fingerprint, metrics, same_bits, weights
+
+import evaluate
+import finetune
+import model
+
+pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
+
+
+def adapting(run, recorded, options="", task="door-close"):
+    """The command line that adapts the short run's policy."""
+    common = f"--task {task} --demonstrations 2 --steps 2 --episodes 0 --device cpu {options}"
+    return [*common.split(), "--data", str(recorded), "--checkpoint", str(run / "ema-00006.pt")]
+
+
+def own_recording(frames=200, action_dim=4, ends=None, state_dim=9, task="stir"):
+    """A user's recording of random numbers, not checked."""
+    rng = np.random.default_rng(0)
+    return {
+        "task": task,
+        "instruction": "Stir the soup.",
+        "points": rng.normal(size=(frames, 64, 3)).astype(np.float16),
+        "state": rng.normal(size=(frames, state_dim)).astype(np.float32),
+        "action": rng.uniform(-1, 1, size=(frames, action_dim)).astype(np.float32),
+        "episode_ends": np.array([frames] if ends is None else ends, dtype=np.int64),
+        "meta": "{}",
+    }
+
+
+# ---- Adaptation ----------------------------------------------------------------------------------
+
+
+def test_finetuning_needs_only_a_task_and_reports_before_and_after(
+    recorded, monkeypatch, tmp_path, capsys
+):
+    argv = "--task door-close --demonstrations 2 --steps 4 --batch 4 --episodes 1 --device cpu"
+    finetune.main([*argv.split(), "--data", str(recorded)])
+    folder = Path("runs/finetune/door-close-seed0")
+    names = "adapted.pt config.json metrics.jsonl success.json success.md success.png"
+    assert sorted(path.name for path in folder.iterdir()) == names.split()
+    columns = json.loads((folder / "success.json").read_text())["successes"]
+    assert list(columns) == ["before", "after"]
+    assert all(len(column["door-close"]) == 1 for column in columns.values())
+    printed = capsys.readouterr().out
+    assert "using the policy that comes with the code" in printed and "adapted to" in printed
+    assert "| before | after | paper |" in printed
+    assert [line["step"] for line in metrics(folder)] == [1, 2, 3, 4]
+
+    policy, info = weights(folder / "adapted.pt")
+    assert info["adapted_to"] == "door-close" and info["preset"] == "small"
+    old = weights(evaluate.SHIPPED_CHECKPOINT)[0]
+    assert any(not torch.equal(policy[name], old[name]) for name in old)
+    assert not torch.equal(policy["normalizer.state_scale"], old["normalizer.state_scale"])
+    assert evaluate.SHIPPED_CHECKPOINT.stat().st_size < 16 * 2**20
+
+    before = fingerprint(folder)
+    message = fails(finetune, [*argv.split(), "--data", str(recorded)], capsys)
+    assert "already holds adapted.pt: add --overwrite" in message
+    assert fingerprint(folder) == before
+
+
+def test_adaptation_is_repeatable_and_moves_only_what_has_a_learning_rate(run, recorded):
+    frozen = "--lr-vision 0 --lr-other 0 --normalizer keep"
+    for name, options in {"a": "", "b": "", "frozen": frozen}.items():
+        finetune.main([*adapting(run, recorded, options), "--out", name])
+    a, b, frozen = (weights(f"{name}/adapted.pt")[0] for name in ("a", "b", "frozen"))
+    old = weights(run / "ema-00006.pt")[0]
+    assert same_bits(dict(a), dict(b))
+
+    def moved(new):
+        return {name.split(".")[0] for name in old if not torch.equal(old[name], new[name])}
+
+    assert moved(a) == {"observation_encoder", "demo_encoder", "u2t", "unet", "normalizer"}
+    assert moved(frozen) == {"unet"}
+
+
+def test_all_novel_tasks_are_adapted_to_as_each_alone(run, recorded):
+    finetune.main([*adapting(run, recorded, "--episodes 1", task="novel"), "--out", "all"])
+    finetune.main([*adapting(run, recorded), "--out", "alone"])
+    adapted, info = weights("all/door-close/adapted.pt")
+    assert same_bits(dict(adapted), dict(weights("alone/adapted.pt")[0]))
+    assert info["adapted_to"] == "door-close"
+    report = json.loads(Path("all/success.json").read_text())
+    assert list(report["successes"]["after"]) == ["door-close"]
+
+
+def test_rollouts_read_the_demonstrations_that_were_adapted_to(run, recorded, monkeypatch):
+    seen = []
+
+    def evaluate_nothing(*args):
+        seen.append(args[-1])
+        return {"reach": [True]}
+
+    monkeypatch.setattr(evaluate, "evaluate", evaluate_nothing)
+    file = recorded / "reach.npz"
+    argv = [*adapting(run, file, "--episodes 1", task="reach"), "--demonstrations", "1"]
+    finetune.main(argv)
+    assert seen == [1, 1]  # before and after
+
+
+def test_own_recordings_are_adapted_to_without_a_simulator(run, capsys):
+    np.savez("own.npz", **own_recording(frames=150))
+    checkpoint = ["--checkpoint", str(run / "ema-00006.pt")]
+    finetune.main(["--data", "own.npz", *checkpoint, "--demonstrations", "1", "--steps", "2"])
+    folder = Path("runs/finetune/stir-seed0")
+    names = ["adapted.pt", "config.json", "metrics.jsonl"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    assert "adapted to stir" in capsys.readouterr().out
+
+
+# ---- Bad input -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ("", "name a task of Meta-World with --task"),
+        ("--task shelf-plce", "unknown task 'shelf-plce': did you mean 'shelf-place'?"),
+        ("--task shelf-place --steps 0", "--steps is 0: use at least 1"),
+        ("--task shelf-place --lr-other -1", "--lr-other is -1.0: use at least 0"),
+        ("--task shelf-place --checkpoint none.pt", "none.pt"),
+        ("--task novel --suite ml1", "unknown suite 'ml1'"),
+    ],
+)
+def test_a_wrong_argument_ends_in_one_line_that_says_what_to_do(options, message, capsys):
+    assert message in fails(finetune, options.split(), capsys)
+
+
+@pytest.mark.parametrize(
+    "changes, options, message",
+    [
+        ({"frames": 220}, "", "has 11 frames (every 20th), the policy 10 positions"),
+        ({"action_dim": 7}, "", "(9, 7, 64) dimensions, the policy's have (9, 4, "),
+        ({"frames": 0, "ends": []}, "", "holds no episodes"),
+        ({}, "--demonstrations 3", "3 demonstrations of stir asked for, there are 1"),
+    ],
+)
+def test_demonstrations_that_do_not_fit_are_refused(run, capsys, changes, options, message):
+    np.savez("own.npz", **own_recording(**changes))
+    argv = ["--data", "own.npz", "--checkpoint", run / "ema-00006.pt", "--steps", "1"]
+    assert message in fails(finetune, [*argv, *options.split()], capsys)
+    assert not list(Path().rglob("adapted.pt"))
+
+
+def test_an_adaptation_that_diverges_stops_and_writes_nothing(run, recorded, capsys):
+    argv = adapting(run, recorded, "--lr-diffusion 1e30")
+    message = fails(finetune, [*argv, "--steps", "20"], capsys)
+    assert "not finite at step" in message and "door-close" in message
+    assert not list(Path().rglob("adapted.pt"))
+
+
+def test_a_folder_that_cannot_be_made_ends_in_one_line(run, recorded, capsys):
+    Path("taken").write_text("a file")
+    assert "taken" in fails(finetune, [*adapting(run, recorded), "--out", "taken"], capsys)
+    assert Path("taken").read_text() == "a file"
+
+
+def test_a_checkpoint_that_does_not_fit_is_refused(run, recorded, capsys):
+    info = torch.load(run / "ema-00006.pt", weights_only=True)
+    torch.save(info | {"config": info["config"] | {"unet_widths": [32, 64]}}, "shape.pt")
+    Path("cut.pt").write_bytes((run / "ema-00006.pt").read_bytes()[:1000])
+    torch.save(info | {"text_weights": "openai-ViT-B-32-40d36571"}, "clip.pt")
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    model.save_checkpoint("bare.pt", policy)
+    messages = {
+        "shape.pt": "weights and configuration do not fit",
+        "cut.pt": "damaged",
+        "clip.pt": "'openai-ViT-B-32-40d36571'",
+        "bare.pt": "suite",
+    }
+    for name, message in messages.items():
+        argv = [*adapting(run, recorded, "--clip-weights random"), "--checkpoint", name]
+        assert message in fails(finetune, argv, capsys)

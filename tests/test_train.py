@@ -1,0 +1,303 @@
+"""Tests of train.py: Algorithm 1's batches and steps, whole runs at preset `tiny`, bad input."""
+
+import functools
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import (
+    BASE,
+    FEW,
+    SMALL_ML10,
+    fails,
+    fingerprint,
+    metrics,
+    same_bits,
+    weights,
+    whole_state,
+)
+from test_finetune import own_recording
+
+import data
+import evaluate
+import finetune
+import model
+import train
+
+ROOT = Path(train.__file__).resolve().parent
+pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
+
+
+# ---- Settings, learning rate, batches ------------------------------------------------------------
+
+
+def test_every_setting_is_a_flag_and_is_kept(run):
+    args = train.parse([])
+    assert all(hasattr(args, name) for name in asdict(train.Settings()))
+    assert weights(run / "ema-00006.pt")[1]["arguments"].keys() == asdict(train.Settings()).keys()
+
+
+def test_the_learning_rate_warms_up_and_falls_to_zero_along_a_cosine():
+    rate = functools.partial(train.learning_rate, steps=1500, peak=1e-3, warmup=500)
+    assert rate(0) == pytest.approx(1e-3 / 500)
+    assert rate(499) == rate(500) == pytest.approx(1e-3)
+    assert rate(1000) == pytest.approx(5e-4)
+    assert 0 < rate(1499) < 1e-8 and rate(1500) == pytest.approx(0, abs=1e-12)
+    assert train.learning_rate(0, 10, 1.0, 0) == 1.0  # no warm-up
+    assert np.all(np.diff([rate(step) for step in range(500, 1500)]) < 0)
+
+
+def test_support_and_query_are_disjoint_and_share_the_demonstration(recorded):
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    demonstrations = data.load_demonstrations(recorded / "reach.npz")
+    sampler = data.WindowSampler(demonstrations, policy.config)
+    batch = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, 1, 2))
+    support, query = train.split(batch, 4)
+    for name in batch:
+        if name in train.PER_WINDOW:
+            assert torch.equal(torch.cat([support[name], query[name]]), batch[name])
+            assert len(support[name]) == 4
+        else:
+            assert support[name] is query[name] and len(batch[name]) == 1
+    again = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, 1, 2))
+    other = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, 2, 2))
+    assert same_bits(batch, again) and not torch.equal(batch["noise"], other["noise"])
+    assert not torch.equal(batch["action"], other["action"])
+
+
+# ---- Whole runs ----------------------------------------------------------------------------------
+
+
+def test_training_leaves_everything_that_it_promises(run):
+    names = "config.json curves.png ema-00003.pt ema-00006.pt last.pt metrics.jsonl"
+    names += " success.json success.md success.png"
+    assert sorted(path.name for path in run.iterdir()) == names.split()
+    config = json.loads((run / "config.json").read_text())
+    assert config["arguments"]["steps"] == 6 and config["text_weights"] == "random-seed-0"
+    assert model.PolicyConfig(**config["config"]) == model.PRESETS["tiny"]
+
+    lines = [line for line in metrics(run) if "loss" in line]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
+    assert all(np.isfinite(line["loss"]) and line["gradient_norm"] > 0 for line in lines)
+    (evaluated,) = (line for line in metrics(run) if "success" in line)
+    report = json.loads((run / "success.json").read_text())
+    successes = report["successes"]["last checkpoint"]
+    assert list(successes) == BASE and all(len(episodes) == 2 for episodes in successes.values())
+    assert evaluated["successes"] == successes
+    assert evaluated["success"] == evaluate.mean_success(successes)
+    assert report["facts"]["seed"] == train.EVALUATION_SEED == 0
+    table = (run / "success.md").read_text()
+    assert all(f"| {task} |" in table for task in BASE)
+    assert "paper" in table and "random-seed-0" in table
+    for name in ("curves.png", "success.png"):
+        assert (run / name).read_bytes().startswith(b"\x89PNG")
+
+    policy, ema = whole_state(run)["training"]["policy"], weights(run / "ema-00006.pt")[0]
+    assert all(torch.equal(ema[name], policy[name]) for name in ema if "normalizer" in name)
+    assert ema["normalizer.action_scale"].ne(1).any()  # fitted
+    assert not torch.equal(ema["unet.head.1.weight"], policy["unet.head.1.weight"])
+
+
+def killed_run(recorded, out, step):
+    """Trains in a process killed (SIGKILL) just after logging `step`, between two savings."""
+    program = f"""
+import os, signal
+import evaluate, simulator, train
+simulator.SUITES["ml10"] = {SMALL_ML10!r}
+log = evaluate.log
+def log_and_die(folder, **values):
+    log(folder, **values)
+    if values["step"] == {step}:
+        os.kill(os.getpid(), signal.SIGKILL)
+evaluate.log = log_and_die
+train.main({["--data", str(recorded), "--out", str(out), *FEW]!r})
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+
+
+def test_a_run_killed_between_savings_resumes_to_the_same_bits(run, recorded, tmp_path):
+    out = tmp_path / "killed"
+    killed_run(recorded, out, step=5)
+    assert len(metrics(out)) == 5 and weights(out / "last.pt")[1]["step"] == 3
+    with (out / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 6, "lo')  # as if killed while writing
+    train.main(["--data", str(recorded), "--out", str(out), "--resume", *FEW])
+    assert [line["step"] for line in metrics(out)] == [1, 2, 3, 4, 5, 6]
+    assert same_bits(whole_state(out), whole_state(run))
+    for whole, resumed in zip([line for line in metrics(run) if "loss" in line], metrics(out)):
+        assert {**whole, "seconds": 0} == {**resumed, "seconds": 0}
+
+
+def test_ctrl_c_saves_says_how_to_resume_and_ends_with_130(
+    run, recorded, tmp_path, monkeypatch, capsys
+):
+    log, out = evaluate.log, tmp_path / "interrupted"
+
+    def log_and_interrupt(folder, **values):
+        log(folder, **values)
+        if values["step"] == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(evaluate, "log", log_and_interrupt)
+    argv = ["--data", str(recorded), "--out", str(out), *FEW]
+    with pytest.raises(SystemExit) as end:
+        data.command_line(lambda: train.main(argv))
+    error = capsys.readouterr().err
+    assert end.value.code == 130 and "saved after step 2" in error and "--resume" in error
+    assert weights(out / "last.pt")[1]["step"] == 2
+    monkeypatch.setattr(evaluate, "log", log)
+    train.main([*argv, "--resume"])
+    assert same_bits(whole_state(out), whole_state(run))
+
+
+WAYS = {
+    "second": "",
+    "loop": "--vectorize 1",
+    "first": "--maml first",
+    "off": "--maml off",
+    "mlp": "--demo-encoder mlp",
+    "baseline": "--demo-encoder mlp --tcfm none",
+    "+VMT": "--tcfm none",
+    "dp3": "--maml off --demo-encoder none --tcfm none",
+}
+
+
+def test_every_way_of_training_learns_something_of_its_own(recorded, tmp_path):
+    def first_lines(name, options):
+        argv = [*FEW, *options.split(), "--steps", "2", "--inner-lr", "0.1"]
+        train.main(["--data", str(recorded), "--out", str(tmp_path / name), *argv])
+        return metrics(tmp_path / name)
+
+    first_step = {name: first_lines(name, options)[0] for name, options in WAYS.items()}
+    norm = {name: line["gradient_norm"] for name, line in first_step.items()}
+    assert norm["loop"] == pytest.approx(norm["second"], rel=1e-4)
+    assert first_step["first"]["loss"] == pytest.approx(first_step["second"]["loss"], rel=1e-5)
+    assert len({f"{value:.3g}" for name, value in norm.items() if name != "loop"}) == len(WAYS) - 1
+    names = weights(tmp_path / "dp3" / "last.pt")[0]
+    assert not any(name.startswith(("u2t", "demo_encoder", "pooled")) for name in names)
+
+    # The first of the two steps without the inner one
+    half = first_lines("half", "--multi-task-share 0.5")
+    assert half[0] == pytest.approx(first_step["off"] | {"seconds": half[0]["seconds"]})
+    never = first_lines("never", "--multi-task-share 0.5 --maml off")
+    assert half[1]["gradient_norm"] != pytest.approx(never[1]["gradient_norm"], rel=1e-3)
+
+
+def test_two_processes_under_torchrun_train_as_one_does(recorded, tmp_path):
+    script = tmp_path / "small_train.py"
+    script.write_text(
+        "import sys\nimport data, simulator, train\n"
+        f'simulator.SUITES["ml10"] = {SMALL_ML10!r}\n'  # three tasks: unequal shares
+        "data.command_line(lambda: train.main(sys.argv[1:]))\n"
+    )
+
+    def torchrun(processes, argv):
+        launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+        launcher += ["--nproc-per-node", str(processes), str(script)]
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        return subprocess.run([*launcher, *argv], env=environment, capture_output=True, text=True)
+
+    argv = ["--data", str(recorded), *FEW, "--steps", "3", "--checkpoint-every", "3"]
+    two = torchrun(2, ["--out", str(tmp_path / "two"), *argv])
+    assert two.returncode == 0, two.stderr
+    train.main(["--out", str(tmp_path / "one"), *argv])
+    for one, both in zip(metrics(tmp_path / "one"), metrics(tmp_path / "two")):
+        assert both["loss"] == pytest.approx(one["loss"], rel=1e-4)
+        assert both["gradient_norm"] == pytest.approx(one["gradient_norm"], rel=1e-3)
+
+    def all_weights(policy):
+        return torch.cat([policy[n].flatten() for n in one if "normalizer" not in n])
+
+    one, two = (whole_state(tmp_path / name)["training"]["policy"] for name in ("one", "two"))
+    torch.manual_seed(0)
+    start = model.DAMIPolicy(model.PRESETS["tiny"]).state_dict()
+    moved = all_weights(one) - all_weights(start)
+    assert (all_weights(one) - all_weights(two)).norm() < 1e-3 * moved.norm()
+    assert moved.norm() > 0.1
+
+
+def test_more_processes_than_tasks_are_refused_before_anything_waits(monkeypatch, capsys):
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    monkeypatch.setenv("RANK", "0")
+    assert "4 processes for 3 tasks: use at most one a task" in fails(train, FEW, capsys)
+
+
+# ---- Own recordings ------------------------------------------------------------------------------
+
+
+def test_own_recordings_of_any_length_and_dimension_are_trained_on_and_adapted_to(capsys):
+    Path("own").mkdir()
+    for task, ends in (("stir", [60, 90]), ("pour", [200, 350])):
+        recorded = own_recording(ends[-1], action_dim=7, ends=ends, state_dim=7, task=task)
+        np.savez(f"own/{task}.npz", **recorded)
+    argv = "--preset tiny --steps 2 --checkpoint-every 2 --data own --clip-weights random".split()
+    for name, options in {"maml": [], "off": ["--maml", "off"]}.items():
+        train.main([*argv, "--out", f"runs/{name}", *options])
+        policy, info = model.load_checkpoint(f"runs/{name}/ema-00002.pt")
+        config = policy.config
+        assert (config.state_dim, config.action_dim, config.demo_positions) == (7, 7, 25)
+        assert info["suite"] == "own" and info["arguments"]["demonstrations"] is None
+        assert not Path(f"runs/{name}/success.json").exists()
+    checkpoint = ["--checkpoint", "runs/maml/ema-00002.pt"]
+    finetune.main(["--data", "own/pour.npz", *checkpoint, "--steps", "2"])
+    assert weights("runs/finetune/pour-seed0/adapted.pt")[1]["adapted_to"] == "pour"
+    assert "base tasks" not in capsys.readouterr().out
+
+
+# ---- Bad input -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ("--suite ml11", "unknown suite 'ml11': did you mean 'ml10'?"),
+        ("--preset tny", "unknown preset 'tny': did you mean 'tiny'?"),
+        ("--steps 0", "--steps is 0: use at least 1"),
+        ("--demonstrations 0", "--demonstrations is 0: use at least 1"),
+        ("--num-points 0", "num_points is 0: use at least 1"),
+        ("--after-success -1", "--after-success is -1: use at least 0"),
+        ("--seed -1", "--seed is -1: use at least 0"),
+        ("--lr -1", "--lr is -1.0: use at least 0"),
+        ("--lr nan", "--lr is nan"),
+        ("--multi-task-share 7", "--multi-task-share is 7.0: use at most 1"),
+        ("--warmup -3", "--warmup is -3: use at least 0"),
+    ],
+)
+def test_a_wrong_argument_ends_in_one_line_that_says_what_to_do(options, message, recorded, capsys):
+    assert message in fails(train, [*FEW, "--data", recorded, *options.split()], capsys)
+    assert not list(Path().rglob("last.pt"))
+
+
+def test_an_existing_run_is_neither_overwritten_nor_resumed_with_other_settings(
+    run, recorded, capsys
+):
+    before = fingerprint(run)
+    argv = ["--data", recorded, "--out", run, *FEW, "--episodes", "2", "--evaluate-every", "6"]
+    assert "already holds a run: add --resume" in fails(train, argv, capsys)
+    message = fails(train, [*argv, "--resume", "--lr", "0.5"], capsys)
+    assert "lr 0.003 -> 0.5" in message and "steps" not in message
+    message = fails(train, [*argv, "--resume", "--demo-encoder", "mlp"], capsys)
+    assert "demo_encoder vmt -> mlp" in message
+    assert fingerprint(run) == before
+
+
+def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_last_good_state(
+    recorded, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(train, "SAVE_SECONDS", -1)  # saves after every step
+    argv = ["--data", recorded, "--out", tmp_path / "run", *FEW, "--lr", "1e30", "--warmup", "1"]
+    message = fails(train, argv, capsys)
+    assert "smaller --lr" in message
+    step = int(re.search(r"not finite at step (\d+)", message)[1])
+    state, info = weights(tmp_path / "run" / "last.pt")
+    assert info["step"] == step - 1 >= 1 and all(torch.isfinite(x).all() for x in state.values())
+    assert [path.name for path in (tmp_path / "run").iterdir() if path.name.startswith(".")] == []
