@@ -236,7 +236,8 @@ class WindowSampler:
         self.action = torch.tensor(demonstrations.action, dtype=torch.float32, device=device)
 
         meta = demonstrations.meta
-        self.positions = meta.get("positions_in_state", 0) if augment else 0
+        self.known_positions = meta.get("positions_in_state", 0)
+        self.positions = self.known_positions if augment else 0
         box = meta.get("workspace") or [points.min((0, 1)).tolist(), points.max((0, 1)).tolist()]
         self.middle = torch.tensor(box, dtype=torch.float32).mean(
             dim=0, keepdim=True
@@ -252,6 +253,7 @@ class WindowSampler:
             frames = torch.arange(earliest, latest + 1)[:, None] + torch.arange(config.horizon)
             windows.append(frames.clamp(episode.start, episode.stop - 1))  # (windows, H)
         self.windows = torch.cat(windows).to(device)  # (W, H) the frame of each action
+        self.undoing = self.undo_actions() if self.known_positions else None
 
     def check_fit(self, demonstrations: Demonstrations) -> None:
         """Raises ValueError where recording and policy disagree."""
@@ -270,10 +272,27 @@ class WindowSampler:
                 f"the policy {config.demo_positions} positions: cut it, or train on such data"
             )
 
+    def undo_actions(self) -> Tensor:
+        """The action of each frame that leads back to the frame before it, (F, A).
+
+        The displacement is what the first position in the state did, in units of an action, as the
+        fastest frames are to the largest actions; the gripper's is that of the frame before.
+        """
+        hand, before = self.state[:, :3], torch.arange(len(self.state)).roll(1)
+        for episode in self.episodes:
+            before[episode.start] = episode.start  # nothing came before
+        displacement = hand[before] - hand  # (F, 3)
+        forward = self.action[before, :3]
+        fast, full = (x.abs().max(dim=1).values.quantile(0.95) for x in (displacement, forward))
+        undoing = (displacement * full / fast.clamp(min=1e-6)).clamp(-1, 1)
+        return torch.cat([undoing, self.action[before, 3:]], dim=1)
+
     def __len__(self) -> int:
         return len(self.windows)
 
-    def sample(self, n: int, generator: torch.Generator) -> dict[str, Tensor]:
+    def sample(
+        self, n: int, generator: torch.Generator, backwards: bool = False
+    ) -> dict[str, Tensor]:
         """Draws n different windows (with repetition only where there are fewer than n).
 
         Returns points (n, To, N, 3), state (n, To, S), action (n, H, A), all float32.
@@ -282,19 +301,22 @@ class WindowSampler:
             chosen = torch.randperm(len(self), generator=generator, device=generator.device)[:n]
         else:
             chosen = torch.randint(len(self), (n,), generator=generator, device=generator.device)
-        return self.gather(chosen)
+        return self.gather(chosen, backwards)
 
-    def gather(self, indices: Tensor) -> dict[str, Tensor]:
+    def gather(self, indices: Tensor, backwards: bool = False) -> dict[str, Tensor]:
         """Returns the windows of these indices (n,), as `sample` does."""
         frames = self.windows[indices.to(self.windows.device)]  # (n, H)
+        frames = frames.flip(1) if backwards else frames
         observed = frames[:, : self.config.n_obs_steps]  # (n, To)
         return {
             "points": self.points[observed].float(),  # (n, To, N, 3)
             "state": self.state[observed],  # (n, To, S)
-            "action": self.action[frames],  # (n, H, A)
+            "action": (self.undoing if backwards else self.action)[frames],  # (n, H, A)
         }
 
-    def demonstration(self, episode: torch.Generator | int) -> dict[str, Tensor]:
+    def demonstration(
+        self, episode: torch.Generator | int, backwards: bool = False
+    ) -> dict[str, Tensor]:
         """Returns a complete episode, drawn or named by its number, every demo_stride-th frame.
 
         Returns demo_points (1, T, N, 3), demo_state (1, T, S), demo_action (1, T, A), all float32:
@@ -304,20 +326,24 @@ class WindowSampler:
             count, device = len(self.episodes), episode.device
             episode = int(torch.randint(count, (1,), generator=episode, device=device))
         whole = self.episodes[episode]
-        frames = slice(whole.start, whole.stop, self.config.demo_stride)
+        frames = torch.arange(whole.start, whole.stop, self.config.demo_stride)
+        frames = frames.flip(0) if backwards else frames
         return {
             "demo_points": self.points[None, frames].float(),
             "demo_state": self.state[None, frames],
-            "demo_action": self.action[None, frames],
+            "demo_action": (self.undoing if backwards else self.action)[None, frames],
         }
 
-    def batch(self, n: int, generator: torch.Generator) -> dict[str, Tensor]:
+    def batch(
+        self, n: int, generator: torch.Generator, backwards: bool = False
+    ) -> dict[str, Tensor]:
         """Draws n windows and one reference demonstration, which may be one that a window is from.
 
-        Returns what `sample` and `demonstration` do.
+        `backwards` plays both from their last frame to the first, with actions that undo: another
+        task in the same scene. Returns what `sample` and `demonstration` do.
         """
-        demo = self.demonstration(generator)
-        windows = self.sample(n, generator)
+        demo = self.demonstration(generator, backwards)
+        windows = self.sample(n, generator, backwards)
         if self.positions:
             demo = self.augment(demo, generator, prefix="demo_")
             windows = self.augment(windows, generator)

@@ -3,6 +3,7 @@
     python evaluate.py                                       # base tasks, the newest run
     python evaluate.py --checkpoint runs/a runs/b --top 5    # all checkpoints of two runs
     python evaluate.py --task reach --gif reach.gif          # watch one rollout
+    python evaluate.py --without instruction --swap demonstration    # is the demonstration read?
 
 An episode succeeds if any of its 200 steps reports success, so a rollout ends there. Each rollout
 holds one reference demonstration, drawn from the task's own. Goals come from seeds that no
@@ -173,6 +174,7 @@ def rollout(
     text: Tensor,
     generator: torch.Generator,
     on_chunk: Callable[[int, dict], None] | None = None,
+    blank: bool = False,
 ) -> list[bool]:
     """Rolls out E episodes of one task side by side, and says which of them succeeded.
 
@@ -186,6 +188,7 @@ def rollout(
         text: instruction feature, (text_dim,).
         generator: draws demonstrations and noise; on the CPU.
         on_chunk: called with (index of the environment, observation) before each chunk.
+        blank: the policy sees zeros in place of its demonstration.
 
     Returns:
         E booleans.
@@ -195,6 +198,8 @@ def rollout(
     # One reference demonstration a rollout, held. All are drawn before any noise is; they are
     # encoded one at a time, since they may differ in length.
     demos = [sampler.demonstration(generator) for _ in envs]
+    if blank:
+        demos = [{name: torch.zeros_like(x) for name, x in demo.items()} for demo in demos]
     with torch.no_grad():
         contexts = [policy.encode_demo(text[None], **demo) for demo in demos]
 
@@ -259,7 +264,12 @@ def load_policy(checkpoint: str, device: str) -> None:
 
 
 def rollout_job(
-    task: str, data: str, n_demonstrations: int | None, text: np.ndarray, seeds: list[int]
+    task: str,
+    data: str,
+    n_demonstrations: int | None,
+    text: np.ndarray,
+    seeds: list[int],
+    blank: bool = False,
 ) -> list[bool]:
     """Rolls out the episodes of these seeds, of one task, in a worker process."""
     policy = loaded["policy"]
@@ -277,7 +287,7 @@ def rollout_job(
 
     envs, generator = loaded["envs"][: len(seeds)], torch.Generator().manual_seed(seeds[0])
     text = torch.from_numpy(text).to(device)
-    success = rollout(policy, envs, seeds, loaded["sampler"], text, generator, on_chunk)
+    success = rollout(policy, envs, seeds, loaded["sampler"], text, generator, on_chunk, blank)
     worker.finished.put((task, len(seeds)))
     return success
 
@@ -291,6 +301,7 @@ def evaluate(
     workers: int | None = None,
     device: str | torch.device = "cpu",
     n_demonstrations: int | None = None,
+    blank: bool = False,
 ) -> Successes:
     """Rolls a checkpoint out on Meta-World tasks in parallel processes.
 
@@ -303,6 +314,7 @@ def evaluate(
         workers: processes, by default one a core.
         device: where the policy runs.
         n_demonstrations: use only the first so many of each file; None: all.
+        blank: the policy sees zeros in place of its demonstration.
 
     Returns:
         task -> E booleans, in the order of the episodes. They do not depend on `workers`.
@@ -312,7 +324,7 @@ def evaluate(
     seeds = [evaluation_seed(seed, i) for i in range(episodes)]
     chunks = [seeds[i : i + EPISODES_A_JOB] for i in range(0, episodes, EPISODES_A_JOB)]
     jobs = [
-        (task, str(path), n_demonstrations, text[task].cpu().numpy(), chunk)
+        (task, str(path), n_demonstrations, text[task].cpu().numpy(), chunk, blank)
         for task, path in demonstrations.items()
         for chunk in chunks
     ]
@@ -572,6 +584,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add(
         "--top", type=int, default=0, help="all checkpoints of a run; also the mean of the best TOP"
     )
+    parts = {"nargs": "+", "choices": ("demonstration", "instruction"), "default": []}
+    add("--swap", **parts, help="measure also with these of another task")
+    add("--without", **parts, help="leave these out: zeros in their place")
     add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
@@ -593,6 +608,12 @@ def choose_tasks(args: argparse.Namespace, suite: str, info: dict[str, Any]) -> 
         raise ValueError("a policy of own recordings has no simulator to be measured in")
     base, novel = suite_tasks(suite)
     return {"base": base, "novel": novel, "all": base + novel}[args.split]
+
+
+def of_next_task(each: dict[str, Any]) -> dict[str, Any]:
+    """Every task gets what belongs to the next one, the last what belongs to the first."""
+    values = list(each.values())
+    return dict(zip(each, values[1:] + values[:1]))
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -622,6 +643,8 @@ def main(argv: list[str] | None = None) -> None:
     # Tasks, their demonstrations and instructions
     suite = args.suite or info["suite"]
     tasks = choose_tasks(args, suite, info)
+    if args.swap and (len(tasks) < 2 or args.top):
+        raise ValueError("--swap needs the tasks of a split, and the last checkpoint alone")
     out = Path(args.out)
     if not args.gif:
         claim_folder(out, "success.json", args.overwrite)
@@ -637,13 +660,21 @@ def main(argv: list[str] | None = None) -> None:
         print(f"{args.task}: {'success' if success else 'failure'}; wrote {args.gif}")
         return
 
-    results = {}
+    blank = "demonstration" in args.without
+    if "instruction" in args.without:
+        text = {task: torch.zeros_like(feature) for task, feature in text.items()}
+    protocol = (args.episodes, args.seed, args.workers, device, args.demonstrations, blank)
+    results, swapped = {}, {}
     for checkpoint in labels:
         _, info = load_checkpoint(checkpoint, needs=TRAINED)
         if info["text_weights"] != identity:
             raise ValueError(f"{checkpoint} was made with text weights {info['text_weights']!r}")
-        protocol = (args.episodes, args.seed, args.workers, device, args.demonstrations)
         results[checkpoint] = evaluate(checkpoint, paths, text, *protocol)
+        for part in args.swap:
+            inputs = {"demonstration": paths, "instruction": text}
+            inputs[part] = of_next_task(inputs[part])
+            label = f"{labels[checkpoint]}, {part} of another task"
+            swapped[label] = evaluate(checkpoint, *inputs.values(), *protocol)
 
     facts = {"title": tasks[0] if len(tasks) == 1 else f"{suite}, {args.split} tasks"}
     facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
@@ -653,7 +684,9 @@ def main(argv: list[str] | None = None) -> None:
     if args.top:
         best = [float(np.mean(sorted(run)[-args.top :])) for run in means]
         facts[f"mean, best {args.top} checkpoints"] = mean_interval(best)
-    columns = {labels[run[-1]]: results[run[-1]] for run in runs}
+    if args.without:
+        facts["without"] = " and ".join(args.without)
+    columns = {labels[run[-1]]: results[run[-1]] for run in runs} | swapped
     all_checkpoints = {labels[path]: found for path, found in results.items()} if args.top else None
     print(f"\n{write_report(out, columns, facts, suite, all_checkpoints)}\n")
     for name, value in facts.items():

@@ -44,6 +44,7 @@ class Settings(Flags):
     lr_vision: float | None = setting(None, "learning rate of the observation encoder", least=0)
     lr_diffusion: float | None = setting(None, "learning rate of the U-Net", least=0)
     lr_other: float | None = setting(None, "learning rate of VMT and U2T", least=0)
+    instruction: bool = setting(True, "--no-instruction: adapt and roll out without it")
     normalizer: str = setting("fit", "to the task, or `keep` the suite's", choices=("fit", "keep"))
     demonstrations: int | None = setting(None, "how many (default: 10; of a file all)", least=1)
     episodes: int = setting(20, "rollouts before and after (default: 20)", least=0)
@@ -209,7 +210,7 @@ def main(argv: list[str] | None = None) -> None:
         paths = {tasks[0]: file}
     instructions = [load_demonstrations(paths[task]).instruction for task in tasks]
     features, identity = text_features(instructions, args.clip_weights, info["text_weights"])
-    text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
+    text = dict(zip(tasks, features.to(device) * settings.instruction))  # each (text_dim,)
 
     columns, seconds = {"before": {}, "after": {}}, 0.0
     for task in tasks:

@@ -62,7 +62,7 @@ def meta_gradient(
     steps: int = 1,
     first_order: bool = False,
     vectorize: int = 1,
-) -> tuple[Params, Tensor]:
+) -> tuple[Params, Tensor, Tensor]:
     """The gradient of the mean query loss, through each task's inner loop (Eq. 3; Algorithm 1).
 
     Args:
@@ -75,7 +75,8 @@ def meta_gradient(
             tensors only.
 
     Returns:
-        (gradients, losses): name -> tensor, and the query losses after adaptation (tasks,).
+        (gradients, after, before): name -> tensor, and the query losses with the adapted parameters
+        and with the given ones, both (tasks,).
 
     Raises:
         ValueError: `tasks` is empty, or `vectorize` is less than 1.
@@ -85,16 +86,19 @@ def meta_gradient(
     # If they required grad, autograd would record all of this once more, beneath torch.func.
     params = {name: p.detach() for name, p in params.items()}
 
-    def query_loss(params: Params, support: Any, query: Any) -> Tensor:
-        return loss_fn(adapt(loss_fn, params, support, lr, steps, first_order), query)
+    def query_losses(params: Params, support: Any, query: Any) -> Tensor:
+        adapted = adapt(loss_fn, params, support, lr, steps, first_order)
+        with torch.no_grad():
+            before = loss_fn(params, query)
+        return torch.stack([loss_fn(adapted, query), before])
 
     def summed_query_loss(params: Params, chunk: list) -> tuple[Tensor, Tensor]:
         if len(chunk) == 1:
-            losses = query_loss(params, *chunk[0])[None]
+            losses = query_losses(params, *chunk[0])[None]
         else:
             support, query = tree_map(lambda *parts: torch.stack(parts), *chunk)
-            losses = torch.vmap(query_loss, in_dims=(None, 0, 0))(params, support, query)
-        return losses.sum(), losses
+            losses = torch.vmap(query_losses, in_dims=(None, 0, 0))(params, support, query)
+        return losses[:, 0].sum(), losses  # (tasks, 2)
 
     tasks, total, losses = iter(tasks), None, []
     while chunk := list(islice(tasks, vectorize)):
@@ -106,5 +110,5 @@ def meta_gradient(
             total = {name: total[name].add_(g) for name, g in gradients.items()}
     if total is None:
         raise ValueError("meta_gradient needs at least one task")
-    losses = torch.cat(losses)
-    return {name: g / len(losses) for name, g in total.items()}, losses
+    after, before = torch.cat(losses).unbind(dim=1)
+    return {name: g / len(after) for name, g in total.items()}, after, before

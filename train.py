@@ -77,6 +77,12 @@ class Settings(Flags):
         None, "windows begin at most so many frames after the success", least=0
     )
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
+    instruction_dropout: float = setting(
+        0.0, "share of the batches that see no instruction", least=0, most=1
+    )
+    backwards: float = setting(
+        0.0, "share played backwards, without instruction: other tasks", least=0, most=1
+    )
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
@@ -91,6 +97,8 @@ SETTINGS = {
         preset="small", steps=10_000, support=4, query=12, lr=1e-3, warmup=100,
         multi_task_share=0.8,  # a quarter of the time a step, and nearly the same gradient
         after_success=20,  # three in five of the experts' frames are later
+        instruction_dropout=0.5, backwards=0.25,  # or the demonstration is not read
+        inner_lr=3e-3,  # at 1e-4 an inner step moves nothing
         vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=10_000,
     ),
     "tiny": Settings(
@@ -109,15 +117,29 @@ PER_WINDOW = ("points", "state", "action", "noise", "timesteps")  # of a batch; 
 
 
 def task_batch(
-    policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, n: int, seed: tuple[int, ...]
+    policy: DAMIPolicy,
+    sampler: WindowSampler,
+    text: Tensor,
+    n: int,
+    seed: tuple[int, ...],
+    instruction_dropout: float = 0.0,
+    backwards: float = 0.0,
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
+    Where the instruction names the task, nothing else need be read. In a share of the batches it
+    is therefore left out (zeros), and in another share the episodes are played backwards, too: a
+    task that only the demonstration tells, in scenes where another one is known.
+
     Returns the keyword arguments of `policy.loss`. They follow from `seed` alone.
     """
-    state = np.random.SeedSequence(seed).generate_state(1, np.uint64)
-    generator = torch.Generator().manual_seed(int(state[0]))
-    windows = sampler.batch(n, generator)
+    first, second = np.random.SeedSequence(seed).generate_state(2, np.uint64)
+    generator = torch.Generator().manual_seed(int(first))
+    drop, turn = torch.rand(2, generator=torch.Generator().manual_seed(int(second)))
+    back = bool(turn < backwards) and sampler.undoing is not None
+    if back or drop < instruction_dropout:
+        text = torch.zeros_like(text)
+    windows = sampler.batch(n, generator, back)
     return {"text": text[None], **windows, **policy.draw_noise_and_timesteps(n, generator)}
 
 
@@ -159,7 +181,7 @@ def meta_train(
     start: int = 0,
     rank: int = 0,
     world: int = 1,
-) -> Iterator[tuple[int, float, float]]:
+) -> Iterator[tuple[int, dict[str, float]]]:
     """Algorithm 1: trains `policy` and its average `ema`, from outer step `start` on.
 
     Args:
@@ -167,7 +189,8 @@ def meta_train(
         rank, world: this process's number, and how many share the tasks.
 
     Yields:
-        (steps done, query loss, norm of the gradient) after each outer step.
+        (steps done, figures) after each outer step: loss (of the query, after the inner step),
+        gradient_norm, and loss_before (of the query, with the parameters as they were).
 
     Raises:
         ValueError: the loss or its gradient is not finite; this step changed nothing.
@@ -175,6 +198,7 @@ def meta_train(
     params = dict(policy.named_parameters())
     my_tasks = list(enumerate(samplers))[rank::world]
     n = settings.support + settings.query
+    hidden = settings.instruction_dropout, settings.backwards
     lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
     at_once = settings.vectorize if len(lengths) == 1 else 1  # stacking needs equal lengths
     multi_task_share = 1.0 if settings.maml == "off" else settings.multi_task_share
@@ -186,15 +210,16 @@ def meta_train(
     for step in range(start, settings.steps):  # lines 2, 22
         # A generator: the batches of `at_once` tasks are in memory, not those of all.
         batches = (  # lines 3 to 6, 9
-            task_batch(policy, samplers[task], text[task], n, (settings.seed, step, index))
+            task_batch(policy, samplers[task], text[task], n, (settings.seed, step, index), *hidden)
             for index, task in my_tasks
         )
 
         if step < multi_task_steps:
             gradients, losses = multi_task_gradient(policy, list(batches))
+            figures = {}
         else:  # lines 4 to 19: the inner step on support, the gradient of the query loss through it
             pairs = (split(batch, settings.support) for batch in batches)
-            gradients, losses = meta_gradient(
+            gradients, losses, before = meta_gradient(
                 loss_fn,
                 params,
                 pairs,
@@ -202,6 +227,7 @@ def meta_train(
                 first_order=settings.maml == "first",
                 vectorize=at_once,
             )
+            figures = {"loss_before": before.mean().item()}
         loss = losses.mean()
 
         if world > 1:  # the mean over all tasks: the processes' means, weighted by their shares
@@ -220,7 +246,7 @@ def meta_train(
         optimizer.param_groups[0]["lr"] = learning_rate(step, settings.steps, peak, settings.warmup)
         optimizer.step()  # line 20
         ema.update_parameters(policy)  # line 21
-        yield step + 1, loss.item(), norm.item()
+        yield step + 1, figures | {"loss": loss.item(), "gradient_norm": norm.item()}
 
 
 # ---- What a run is made from ---------------------------------------------------------------------
@@ -382,15 +408,15 @@ def main(argv: list[str] | None = None) -> None:
     bar |= {"total": settings.steps, "initial": start}
     with evaluate.StopRequest() as stop, tqdm(**bar) as progress:
         began = saved = time.monotonic()
-        for step, loss, norm in meta_train(
+        for step, figures in meta_train(
             policy, ema, optimizer, samplers, text, settings, start, rank, world
         ):
             seconds += time.monotonic() - began
             if leader:
                 progress.update()
-                progress.set_postfix(loss=f"{loss:.4f}")
-                line = {"loss": loss, "gradient_norm": norm, "lr": optimizer.param_groups[0]["lr"]}
-                evaluate.log(folder, step=step, **line, seconds=round(seconds, 2))
+                progress.set_postfix(loss=f"{figures['loss']:.4f}")
+                figures["lr"] = optimizer.param_groups[0]["lr"]
+                evaluate.log(folder, step=step, **figures, seconds=round(seconds, 2))
 
                 final = step == settings.steps
                 milestone = final or step % settings.checkpoint_every == 0

@@ -259,7 +259,7 @@ def inner_step_table(folder: str, seeds: int = 5) -> None:
                         [loss_fn(p, b) for b in (support, query)] for p in (adapted, params)
                     )
                 losses.append([(a / b - 1).item() for a, b in zip(after, before)])
-            plain, _ = meta_gradient(loss_fn, params, pairs, lr=0.0)
+            plain, *_ = meta_gradient(loss_fn, params, pairs, lr=0.0)
             gradient.append(change(meta_gradient(loss_fn, params, pairs, lr)[0], plain))
         support, query = np.median(losses, axis=0)
         cells = (

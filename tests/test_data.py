@@ -426,3 +426,34 @@ def test_interrupting_ends_with_exit_code_130(capsys):
     with pytest.raises(SystemExit) as end:
         data.command_line(lambda: say(KeyboardInterrupt()))
     assert end.value.code == 130 and "interrupted" in capsys.readouterr().err
+
+
+# ---- Backwards -----------------------------------------------------------------------------------
+
+
+def test_backwards_the_actions_undo_what_the_episode_did():
+    """A hand that each action moves by a centimetre times the action."""
+    demonstrations = recording((60, 40))
+    action = demonstrations.action
+    state = demonstrations.state.copy()
+    for episode in (slice(0, 60), slice(60, 100)):
+        state[episode, :3] = 0.01 * np.cumsum(action[episode, :3], axis=0)
+        state[episode, :3] -= 0.01 * action[episode, :3]  # a frame is seen before its action
+    meta = {"positions_in_state": 3}
+    sampler = WindowSampler(replace(demonstrations, state=state, meta=meta), SIZES)
+
+    windows = sampler.sample(50, seeded(), backwards=True)
+    forwards = sampler.sample(50, seeded())
+    frames = sampler.windows[torch.randperm(len(sampler), generator=seeded())[:50]]
+    assert torch.equal(windows["points"][:, 0], sampler.points[frames[:, -1]].float())
+    assert not torch.equal(windows["points"], forwards["points"])
+    moved = windows["state"][:, 1, :3] - windows["state"][:, 0, :3]
+    inside = frames[:, -1] != frames[:, -2]  # not padding
+    expected = 0.01 * windows["action"][:, 0, :3]
+    torch.testing.assert_close(moved[inside], expected[inside], atol=2e-3, rtol=0.15)
+    assert torch.equal(windows["action"][inside, 0, 3], sampler.action[frames[inside, -2], 3])
+
+    there, back = (sampler.demonstration(0, backwards) for backwards in (False, True))
+    assert torch.equal(back["demo_points"], there["demo_points"].flip(1))
+    assert torch.equal(back["demo_state"], there["demo_state"].flip(1))
+    assert not torch.equal(back["demo_action"], there["demo_action"].flip(1))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import fails
+from conftest import BASE, fails
 
 import clip
 import data
@@ -137,6 +137,39 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recorded
     for task, episode in [("reach", 0), ("drawer-close", 0), ("reach", 1)]:
         later = job(task, episode)
     assert len(alone) == 5 and np.array_equal(alone, later)
+
+
+def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(
+    run, recorded, monkeypatch, capsys
+):
+    calls = []
+
+    def measured(checkpoint, paths, text, episodes, seed, workers, device, n, blank):
+        calls.append(({t: path.stem for t, path in paths.items()}, text, blank))
+        return {task: [len(calls) == 1] * episodes for task in paths}
+
+    monkeypatch.setattr(evaluate, "evaluate", measured)
+    swap = "--swap demonstration instruction --episodes 2 --out swapped"
+    evaluate.main(evaluating(run, recorded, swap))
+    following = dict(zip(BASE, BASE[1:] + BASE[:1]))
+    own, demonstration, instruction = calls
+    assert own[0] == instruction[0] == {task: task for task in BASE}
+    assert demonstration[0] == following and demonstration[1] is own[1]
+    assert all(torch.equal(instruction[1][t], own[1][following[t]]) for t in BASE)
+    columns = json.loads(Path("swapped/success.json").read_text())["successes"]
+    assert [name.split(", ")[-1] for name in columns][1:] == [
+        "demonstration of another task",
+        "instruction of another task",
+    ]
+    calls.clear()
+    without = "--without demonstration instruction --episodes 2 --out without"
+    evaluate.main(evaluating(run, recorded, without))
+    assert calls[0][2] and all(not text.any() for text in calls[0][1].values())
+    report = json.loads(Path("without/success.json").read_text())
+    assert report["facts"]["without"] == "demonstration and instruction"
+    assert "--swap needs" in fails(
+        evaluate, evaluating(run, recorded, f"--task reach {swap}"), capsys
+    )
 
 
 def test_a_rollout_can_be_watched(run, recorded, monkeypatch, capsys):

@@ -614,3 +614,42 @@ def test_the_printed_table_counts_every_preset(monkeypatch, capsys):
         with torch.device("meta"):
             count = sum(p.numel() for p in DAMIPolicy(config).parameters())
         assert re.search(rf"^{name} +{count:,}$", printed, re.M)
+
+
+# ---- Reading the demonstration -------------------------------------------------------------------
+
+
+def test_where_only_the_demonstration_tells_the_task_it_is_read():
+    """Two tasks in the same scenes, move forth and move back; no instruction."""
+    torch.manual_seed(0)
+    policy = DAMIPolicy(replace(PRESETS["tiny"], num_points=16))
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
+    generator = torch.Generator().manual_seed(0)
+    sign, n = torch.tensor([0.5, -0.5])[:, None, None], 8
+    scenes = lambda *shape: torch.randn(shape, generator=generator)  # noqa: E731
+
+    def demonstrations():
+        action = sign + 0.1 * scenes(2, 5, 4)
+        return {"demo_points": scenes(2, 5, 16, 3), "demo_state": scenes(2, 5, 9)} | {
+            "demo_action": action
+        }
+
+    text = torch.zeros(2, 512)
+    for _ in range(120):
+        windows = {"points": scenes(2 * n, 2, 16, 3), "state": scenes(2 * n, 2, 9)}
+        windows["action"] = sign.repeat_interleave(n, dim=0).expand(-1, 16, 4)
+        noise = policy.draw_noise_and_timesteps(2 * n, generator)
+        loss = policy.loss(text=text, **demonstrations(), **windows, **noise)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    def sampled(demos):
+        with torch.no_grad():
+            context = policy.encode_demo(text, **demos)
+        drawn = policy.sample_actions(scenes(2, 2, 16, 3), scenes(2, 2, 9), context, generator)
+        return drawn.mean(dim=(1, 2))
+
+    own, other = demonstrations(), {name: x.flip(0) for name, x in demonstrations().items()}
+    torch.testing.assert_close(sampled(own), torch.tensor([0.5, -0.5]), atol=0.15, rtol=0)
+    torch.testing.assert_close(sampled(other), torch.tensor([-0.5, 0.5]), atol=0.15, rtol=0)

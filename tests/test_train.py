@@ -73,6 +73,29 @@ def test_support_and_query_are_disjoint_and_share_the_demonstration(recorded):
     assert not torch.equal(batch["action"], other["action"])
 
 
+def test_a_share_of_the_batches_sees_no_instruction_or_is_played_backwards(recorded):
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    demonstrations = data.load_demonstrations(recorded / "reach.npz")
+    sampler = data.WindowSampler(demonstrations, policy.config)
+
+    def batches(*shares):
+        text = torch.ones(512)
+        return [train.task_batch(policy, sampler, text, 4, (0, k, 0), *shares) for k in range(40)]
+
+    plain, dropped, back = batches(), batches(0.5), batches(0.0, 0.25)
+    silent = [bool((batch["text"] == 0).all()) for batch in dropped]
+    assert 10 <= sum(silent) <= 30
+    for one, other in zip(plain, dropped):
+        assert same_bits(one | {"text": 0}, other | {"text": 0})
+    turned = [not torch.equal(a["demo_points"], b["demo_points"]) for a, b in zip(plain, back)]
+    assert 3 <= sum(turned) <= 20
+    for one, other, is_turned in zip(plain, back, turned):
+        assert torch.equal(one["noise"], other["noise"])
+        assert bool((other["text"] == 0).all()) == is_turned
+        if is_turned:
+            assert torch.equal(one["demo_points"].flip(1), other["demo_points"])
+
+
 # ---- Whole runs ----------------------------------------------------------------------------------
 
 
