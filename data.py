@@ -16,11 +16,13 @@ import difflib
 import json
 import math
 import os
+import re
+import signal
 import sys
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -94,7 +96,7 @@ class Demonstrations:
         for part, array in arrays.items():
             dims = 3 if part == "points" else 2
             floats = array.ndim == dims and np.issubdtype(array.dtype, np.floating)
-            if not floats or 0 in array.shape[1:]:
+            if not floats or 0 in array.shape[1:] or not array.dtype.isnative:
                 return f"{part} must be {dims}-dimensional floats, not {array.dtype} {array.shape}"
         if self.points.shape[2] != 3:
             return f"points must be (frames, points, 3), not {self.points.shape}"
@@ -109,6 +111,8 @@ class Demonstrations:
         if len(set(lengths.values())) > 1:
             return f"lengths differ: {lengths}"
 
+        if not re.fullmatch(r"\w[\w.-]{0,99}", self.task):
+            return f"task {self.task[:100]!r} is no name of letters, digits, '-', '_' and '.'"
         positions = self.meta.get("positions_in_state", 0)
         if type(positions) is not int or not 0 <= 3 * positions <= self.state.shape[1]:
             return f"positions_in_state is {positions!r}, a state has {self.state.shape[1]} numbers"
@@ -122,6 +126,8 @@ class Demonstrations:
         for part, array in arrays.items():
             if not np.isfinite(array).all():
                 return f"{part} holds NaN or infinite numbers: record or collect it again"
+        if np.abs(self.points).max() > 1e4:
+            return "points reach beyond ten kilometres: write them in metres"
         return None
 
 
@@ -157,8 +163,9 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
             missing = [part for part in PARTS if part not in file.files]
             arrays = {part: file[part] for part in PARTS if part not in missing}
         meta = dict(json.loads(str(arrays.pop("meta", "{}"))))
-    except (ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} is damaged or no file of demonstrations: {error}") from None
+    except Exception as error:  # numpy and zipfile raise many types; each means it cannot be read
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path} is damaged or no file of demonstrations: {reason}") from None
     if missing:
         raise ValueError(f"{path} is no file of demonstrations: it lacks {', '.join(missing)}")
 
@@ -474,19 +481,28 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
 def command_line(main: Callable[[], None], *errors: type[Exception]) -> None:
     """Runs a script's `main`: what a user can cause ends in one line on stderr and exit code 2.
 
-    That is ValueError, OSError and `errors`; Ctrl-C ends in 130. `python -X dev` shows tracebacks.
+    That is ValueError, OSError and `errors`. Ctrl-C, SIGTERM and a closed terminal end in 130.
+    `python -X dev` shows tracebacks.
     """
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+        if signal.getsignal(number) == signal.SIG_DFL:  # `nohup` has them ignored
+            signal.signal(number, signal.default_int_handler)
     try:
-        main()
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
+        return main()
+    except KeyboardInterrupt as interrupt:
+        line, code = f"interrupted{f': {interrupt}' if str(interrupt) else ''}", 130
     except (ValueError, OSError, *errors) as error:
         if sys.flags.dev_mode:
             raise
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+        line, code = f"error: {' '.join(str(error).split())}", 2
+    except (MemoryError, RuntimeError) as error:
+        if sys.flags.dev_mode or "memory" not in f"{type(error)} {error}".lower():
+            raise
+        line, code = "error: out of memory: use a smaller --preset, batch or --vectorize", 2
+    with suppress(OSError):  # `2>&1 | tee log` may be gone
+        print(line, file=sys.stderr)
+    sys.exit(code)
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:

@@ -17,6 +17,7 @@ N points, A action dim, S state dim.
 """
 
 import argparse
+import fcntl
 import json
 import math
 import os
@@ -25,7 +26,8 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -102,7 +104,7 @@ def pick_device(name: str | None) -> torch.device:
     name = name or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device)
+        torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:
         reason = str(error).split("\n")[0]
         raise ValueError(
@@ -156,11 +158,40 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
     return SHIPPED_CHECKPOINT
 
 
+RESULT_FILES = "adapted.pt", "config.json", "metrics.jsonl"
+RESULT_FILES += "success.json", "success.md", "success.png"
+
+
 def claim_folder(folder: Path, kept: str, overwrite: bool) -> None:
-    """Makes a folder for results; ValueError if `kept` is in it and may not be overwritten."""
+    """Makes a folder for results; ValueError if `kept` is in it and may not be overwritten.
+
+    With `overwrite` old results go, so that none of them stands beside new ones.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / kept).exists() and not overwrite:
         raise ValueError(f"{folder} already holds {kept}: add --overwrite, or choose another --out")
+    for name in RESULT_FILES:
+        (folder / name).unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Makes a folder that no other process may run in, and clears what killed ones left half done.
+
+    The operating system frees it when this process ends, however that comes about.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"another process runs in {folder}: use another --out") from None
+        for temporary in folder.glob(".[0-9]*"):  # of `write_atomically` and `save_checkpoint`
+            temporary.unlink()
+        yield
+    finally:
+        os.close(descriptor)
 
 
 # ---- Rollouts ------------------------------------------------------------------------------------
@@ -487,18 +518,25 @@ def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int,
 
 
 class StopRequest:
-    """Turns the first Ctrl-C into a request to stop after the step at hand; the second stops."""
+    """Turns Ctrl-C, SIGTERM and a closed terminal into a request to stop after the step at hand.
+
+    A second one stops at once, as does the first while `at_once` is set.
+    """
 
     def __enter__(self) -> "StopRequest":
-        self.requested = False
-        self.previous = signal.signal(signal.SIGINT, self.handle)
+        self.requested = self.at_once = False
+        self.previous = {}
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) != signal.SIG_IGN:  # `nohup` has it ignored
+                self.previous[number] = signal.signal(number, self.handle)
         return self
 
     def __exit__(self, *_: Any) -> None:
-        signal.signal(signal.SIGINT, self.previous)
+        for number, handler in self.previous.items():
+            signal.signal(number, handler)
 
     def handle(self, *_: Any) -> None:
-        if self.requested:
+        if self.requested or self.at_once:
             raise KeyboardInterrupt
         self.requested = True
 
@@ -513,8 +551,23 @@ def rewind_metrics(folder: Path, step: int) -> None:
     """Drops the lines that a killed run wrote after its last save; all of them for step 0."""
     path = folder / "metrics.jsonl"
     lines = path.read_text().splitlines() if path.exists() else []
-    kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
+    kept = [line for line in lines if is_whole(line) and json.loads(line)["step"] <= step]
     write_text(path, "".join(f"{line}\n" for line in kept))
+
+
+def is_whole(line: str) -> bool:
+    """Whether a line of metrics.jsonl was written to its end."""
+    try:
+        return isinstance(json.loads(line)["step"], int)
+    except (ValueError, TypeError, KeyError):
+        return False
+
+
+def logged_successes(folder: Path, step: int) -> Successes | None:
+    """What was measured after a step, if it was."""
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    found = [values for values in map(json.loads, lines) if values["step"] == step]
+    return next((values["successes"] for values in found if "successes" in values), None)
 
 
 # ---- Animations ----------------------------------------------------------------------------------
@@ -621,9 +674,13 @@ def main(argv: list[str] | None = None) -> None:
     for name in ("demonstrations", "episodes"):
         if getattr(args, name) < 1:
             raise ValueError(f"--{name} is {getattr(args, name)}: use at least 1")
+    if args.top < 0:
+        raise ValueError(f"--top is {args.top}: use at least 0")
     evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after collecting
     if args.gif and not (args.task and args.gif.endswith(".gif")):
         raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
+    if args.gif and not Path(args.gif).resolve().parent.is_dir():
+        raise ValueError(f"there is no folder to write {args.gif} into")
     device = pick_device(args.device)
 
     # Which checkpoints: of each run the last, or all of them for the mean of the best

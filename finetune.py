@@ -22,13 +22,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 import evaluate
 from clip import text_features
 from data import Flags, WindowSampler, command_line, load_demonstrations, setting
 from model import DAMIPolicy, ema_model, load_checkpoint, save_checkpoint
-from simulator import INSTRUCTIONS, check_task, collect, suite_tasks
+from simulator import INSTRUCTIONS, check_task, collect, progress_bar, suite_tasks
 
 LEARNING_RATES = {"vision": 1e-5, "diffusion": 3e-5, "other": 1e-4}  # AdamW's, by part
 PAPER_LEARNING_RATE = 1e-4  # of the meta-training that they belong to
@@ -134,8 +133,8 @@ def adapt_checkpoint(
     batch = settings.batch or BATCH[info["preset"]]
 
     losses = []
-    bar = {"desc": f"adapting to {demonstrations.task}", "unit": "step", "dynamic_ncols": True}
-    with tqdm(total=settings.steps, **bar) as progress:
+    bar = {"desc": f"adapting to {demonstrations.task}", "unit": "step"}
+    with progress_bar(total=settings.steps, **bar) as progress:
 
         def on_step(step: int, loss: float) -> None:
             losses.append(loss)
@@ -188,7 +187,9 @@ def main(argv: list[str] | None = None) -> None:
     if args.task is None and file is None:
         raise ValueError("name a task of Meta-World with --task, or a recording with --data")
     if file is not None:
-        tasks = [args.task or load_demonstrations(file).task]
+        tasks = [load_demonstrations(file).task]
+        if args.task not in (None, *tasks):
+            raise ValueError(f"{file} is a recording of {tasks[0]}, not of {args.task}")
     else:
         tasks = suite_tasks(args.suite)[1] if args.task == "novel" else [check_task(args.task)]
     simulated = all(task in INSTRUCTIONS for task in tasks)

@@ -26,6 +26,7 @@ import argparse
 import math
 import os
 import shutil
+import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -80,8 +81,8 @@ class PolicyConfig:
         object.__setattr__(self, "unet_widths", tuple(self.unet_widths))
 
         for name, value in vars(self).items():
-            if isinstance(value, int) and value < 1:
-                raise ValueError(f"{name} is {value}: use at least 1")
+            if isinstance(value, int) and not 1 <= value <= 100_000:
+                raise ValueError(f"{name} is {value}: use at least 1, at most 100000")
         choices = {"demo_encoder": ("vmt", "mlp", "none"), "tcfm": ("down", "mid", "up", "none")}
         for name, known in choices.items():
             if getattr(self, name) not in known:
@@ -625,6 +626,7 @@ class DAMIPolicy(nn.Module):
             task: text, demo_points, demo_state, demo_action of D tasks, the arguments of
                 `encode_demo`; D divides B.
         """
+        self.check_shapes(points, state, action, noise, timesteps)
         context = self.encode_demo(**task)
         clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
         if noise is None or timesteps is None:
@@ -655,6 +657,7 @@ class DAMIPolicy(nn.Module):
             (B, Ta, A), to be executed from the newest observation on, in the demonstrations' unit.
         """
         config = self.config
+        self.check_shapes(points, state)
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
         shape = (len(points), config.horizon, config.action_dim)
         source = points.device if generator is None else generator.device
@@ -667,6 +670,28 @@ class DAMIPolicy(nn.Module):
         newest = config.n_obs_steps - 1  # the action that belongs to the newest observation
         chunk = actions[:, newest : newest + config.n_action_steps]  # (B, Ta, A)
         return self.normalizer.unnormalize("action", chunk)
+
+    def check_shapes(
+        self,
+        points: Tensor,
+        state: Tensor,
+        action: Tensor | None = None,
+        noise: Tensor | None = None,
+        timesteps: Tensor | None = None,
+    ) -> None:
+        """Raises ValueError for shapes that would broadcast to a wrong result without an error."""
+        config, B = self.config, len(points)
+        chunk = (B, config.horizon, config.action_dim)
+        points_shape = (B, config.n_obs_steps, *points.shape[2:3], 3)  # any number of points
+        for name, x, shape in (
+            ("points", points, points_shape),
+            ("state", state, (B, config.n_obs_steps, config.state_dim)),
+            ("action", action, chunk),
+            ("noise", noise, chunk),
+            ("timesteps", timesteps, (B,)),
+        ):
+            if x is not None and x.shape != shape:
+                raise ValueError(f"{name} is {tuple(x.shape)}, the policy takes {shape}")
 
     def draw_noise_and_timesteps(
         self, windows: int, generator: torch.Generator | None = None
@@ -710,13 +735,15 @@ def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **
     """
     path = Path(path)
     weights = policy.state_dict()
+    if not all(torch.isfinite(x).all() for x in weights.values()):
+        raise ValueError(f"{path} was not written: the weights are not finite, lower the rates")
     if half:
         weights |= {name: p.detach().half() for name, p in policy.named_parameters()}
     config = asdict(policy.config)
     config = {name: list(v) if isinstance(v, tuple) else v for name, v in config.items()}
     content = {"format": CHECKPOINT_FORMAT, "config": config, "model": weights, **info}
 
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         torch.save(content, temporary)
         os.replace(temporary, path)
@@ -739,19 +766,26 @@ def load_checkpoint(
     if not path.is_file():
         raise ValueError(f"no checkpoint at {path}: name a .pt file, or train one with train.py")
     try:
-        info = torch.load(path, map_location=device, weights_only=True)
+        with zipfile.ZipFile(path) as archive:  # torch.load does not look at the check sums
+            damaged = archive.testzip()
+        info = None if damaged else torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # torch raises many types here; each means it cannot be read
         raise ValueError(f"{path} is damaged or no PyTorch checkpoint: use another file") from error
 
+    if damaged:
+        raise ValueError(f"{path} is damaged (in {damaged}): use another file")
     ours = isinstance(info, dict) and info.get("format") == CHECKPOINT_FORMAT
     missing = [name for name in needs if not ours or name not in info]
     if not ours or missing:
         lacks = f" (it lacks {', '.join(missing)})" if ours else ""
         raise ValueError(f"{path} is not a file of train.py or finetune.py{lacks}: use such a one")
     try:
-        policy = DAMIPolicy(PolicyConfig(**info.pop("config"))).to(device)
-        policy.load_state_dict(info.pop("model"))
-    except (KeyError, TypeError, RuntimeError) as error:
+        config, weights = PolicyConfig(**info.pop("config")), info.pop("model")
+        with torch.device("meta"):  # no memory for a size that the file does not hold
+            DAMIPolicy(config).load_state_dict({k: x.to("meta") for k, x in weights.items()})
+        policy = DAMIPolicy(config).to(device)
+        policy.load_state_dict(weights)
+    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path}: weights and configuration do not fit: {reason}") from error
     return policy.eval(), info

@@ -18,13 +18,14 @@ import multiprocessing
 import os
 import queue
 import signal
+import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -483,6 +484,26 @@ worker = SimpleNamespace(
 )
 
 
+class StandardError:
+    """stderr, as a progress bar needs it, that a closed pipe (`2>&1 | tee log`) does not break."""
+
+    def write(self, text: str) -> None:
+        with suppress(OSError, ValueError):
+            sys.stderr.write(text)
+
+    def flush(self) -> None:
+        with suppress(OSError, ValueError):
+            sys.stderr.flush()
+
+    def fileno(self) -> int:  # tqdm asks for the width of the terminal
+        return sys.stderr.fileno()
+
+
+def progress_bar(**options: Any) -> tqdm:
+    """A progress bar that no closed terminal or pipe ends the work with."""
+    return tqdm(file=StandardError(), dynamic_ncols=True, **options)
+
+
 def run_jobs(
     job: Callable[..., Any],
     jobs: Sequence[tuple],
@@ -520,7 +541,7 @@ def run_jobs(
         with ignored_interrupts():  # submitting launches the processes
             futures = [pool.submit(run_job, job, arguments) for arguments in jobs]
 
-        with tqdm(total=total, desc=label, unit="episode", dynamic_ncols=True) as progress:
+        with progress_bar(total=total, desc=label, unit="episode") as progress:
             pending = set(futures)
             while pending:
                 done, pending = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
@@ -555,7 +576,7 @@ def ignored_interrupts() -> Iterator[None]:
     they still import. Only the main thread may set handlers, and only it is ever interrupted.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
-    signals = (signal.SIGINT, signal.SIGHUP) if in_main_thread else ()
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if in_main_thread else ()
     handlers = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
     try:
         yield
@@ -626,6 +647,7 @@ def collect(
         raise ValueError(f"--episodes is {episodes}: use at least 1")
     episode_seed(seed, 0)  # refuses a seed out of range
     paths = {check_task(task): Path(folder) / f"{task}.npz" for task in tasks}
+    Path(folder).mkdir(parents=True, exist_ok=True)
 
     recipe = RECIPE | {"seed": seed}
     missing = []
@@ -642,6 +664,8 @@ def collect(
         if len(old) < episodes:
             missing.append(task)
 
+    if missing and not os.access(folder, os.W_OK):
+        raise ValueError(f"{folder} cannot be written to: use another --data")
     jobs = [(task, paths[task], episodes, seed) for task in missing]
     run_jobs(collect_task, jobs, workers, len(missing) * episodes, "collecting")
     return paths

@@ -17,11 +17,12 @@ processes without changing what they draw.
 """
 
 import argparse
+import hashlib
 import json
 import math
-import sys
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,6 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.func import functional_call
 from torch.optim.swa_utils import AveragedModel
-from tqdm import tqdm
 
 import evaluate
 from clip import text_features
@@ -47,7 +47,7 @@ from data import (
 )
 from maml import meta_gradient
 from model import PRESETS, DAMIPolicy, PolicyConfig, ema_model, load_checkpoint, save_checkpoint
-from simulator import INSTRUCTIONS, SUITES, collect, suite_tasks
+from simulator import INSTRUCTIONS, SUITES, collect, progress_bar, suite_tasks
 
 # ---- Settings ------------------------------------------------------------------------------------
 
@@ -109,7 +109,7 @@ SETTINGS = {
 # fmt: on
 OWN_FRAMES = 500  # the paper's positions on the real robot
 EVALUATION_SEED = 0  # of the goals; the same for every seed of training
-SAVE_SECONDS = 60  # between two savings of last.pt: what a killed run loses at most
+SAVE_SECONDS = 20  # between two savings of last.pt: what a killed run loses at most
 PER_WINDOW = ("points", "state", "action", "noise", "timesteps")  # of a batch; the rest: per task
 
 
@@ -254,6 +254,8 @@ def meta_train(
 
 def own_recordings(folder: str | Path) -> dict[str, Path]:
     """Task -> file of the recordings in a folder, if none is of a Meta-World task; else {}."""
+    if not Path(folder).is_dir():
+        raise ValueError(f"there is no folder {folder}: with --suite ml10, experts fill it")
     paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
     return {} if set(paths) & set(INSTRUCTIONS) else paths
 
@@ -296,24 +298,37 @@ def initialize(
     return policy, ema_model(policy), optimizer
 
 
+def digest(samplers: dict[str, WindowSampler]) -> str:
+    """A fingerprint of everything that is trained on."""
+    sha = hashlib.sha256()
+    for sampler in samplers.values():
+        for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
+            sha.update(part.cpu().numpy().tobytes())
+    return sha.hexdigest()
+
+
 def restore(
     path: Path,
     policy: DAMIPolicy,
     ema: AveragedModel,
     optimizer: torch.optim.Optimizer,
     settings: Settings,
+    data: str,
 ) -> dict[str, Any]:
     """Puts all three in the state of last.pt; returns the rest of it: step, seconds, text_weights.
 
-    Raises ValueError if the run was started with other settings.
+    Raises ValueError if the run was started with other settings, or on other data (its digest).
     """
-    averaged, left = load_checkpoint(path, policy.normalizer.action_scale.device)
+    device = policy.normalizer.action_scale.device
+    averaged, left = load_checkpoint(path, device, needs=("training", "data"))
     old = left["arguments"] | asdict(averaged.config)
     new = asdict(settings) | asdict(policy.config)
     changed = [f"{k} {old.get(k)} -> {new[k]}" for k in new if old.get(k) != new[k]]
     if changed:
         what = f"other settings ({', '.join(changed)})"
         raise ValueError(f"{path.parent} was started with {what}: give the old ones to resume it")
+    if left["data"] != data:
+        raise ValueError(f"{path.parent} was started on other recordings: bring those back")
     policy.load_state_dict(left["training"]["policy"])
     ema.module.load_state_dict(averaged.state_dict())
     ema.n_averaged.copy_(left["training"]["n_averaged"])
@@ -327,7 +342,7 @@ def restore(
 def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Meta-trains a policy on a suite (Algorithm 1).")
     add = parser.add_argument_group("run").add_argument
-    add("--data", default="data", help="folder of the demonstrations (default: data)")
+    add("--data", help="folder of the demonstrations (default: data)")
     add("--out", help="folder of the run (default: runs/SUITE-PRESET-seedSEED)")
     add("--resume", action="store_true", help="go on from the run's last.pt")
     add("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
@@ -346,7 +361,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
     device = evaluate.pick_device(args.device)
-    own = {} if args.suite else own_recordings(args.data)  # task -> file
+    own = own_recordings(args.data) if args.data and not args.suite else {}  # task -> file
     default = "paper" if device.type == "cuda" else "small"
     preset = choose(args.preset or default, PRESETS, "preset")
     suite = "own" if own else choose(args.suite or "ml10", SUITES, "suite")
@@ -354,44 +369,65 @@ def main(argv: list[str] | None = None) -> None:
     if own:  # all demonstrations unless told otherwise, and no simulator to be rolled out in
         settings = replace(settings, demonstrations=args.demonstrations, episodes=0)
     tasks = list(own) or suite_tasks(suite)[0]
+    paths = own or {task: Path(args.data or "data") / f"{task}.npz" for task in tasks}
     folder = Path(args.out or f"runs/{suite}-{preset}-seed{settings.seed}")
 
     device, rank, world = evaluate.join_processes(device, len(tasks))
-    leader = rank == 0
+    with evaluate.locked(folder) if rank == 0 else nullcontext():
+        if rank == 0:
+            where = f"{device} ({evaluate.hardware(device)})"
+            print(f"preset {preset} on {where}, {len(tasks)} tasks, in {folder}", flush=True)
+            if args.resume and not (folder / "last.pt").exists():
+                raise ValueError(f"there is no run to resume in {folder}: look at --out")
+            if not args.resume and any(folder.glob("*.pt")):
+                raise ValueError(f"{folder} already holds a run: add --resume, or another --out")
+            if not own:
+                collect(tasks, args.data or "data", settings.demonstrations, workers=args.workers)
+        if world > 1:
+            dist.barrier()
+        facts = evaluate.report_facts("train.py", argv, device)
+        run(args, settings, paths, folder, facts, device, rank, world)
+        if world > 1:
+            dist.destroy_process_group()
 
-    # Demonstrations
-    if leader:
-        where = f"{device} ({evaluate.hardware(device)})"
-        print(f"preset {preset} on {where}, {len(tasks)} tasks, run folder {folder}", flush=True)
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / "last.pt").exists() and not args.resume:
-            raise ValueError(f"{folder} already holds a run: add --resume, or choose another --out")
-        if not own:
-            collect(tasks, args.data, settings.demonstrations, workers=args.workers)
-    if world > 1:
-        dist.barrier()
-    paths = own or {task: Path(args.data) / f"{task}.npz" for task in tasks}
+
+def run(
+    args: argparse.Namespace,
+    settings: Settings,
+    paths: dict[str, Path],
+    folder: Path,
+    facts: dict[str, Any],
+    device: torch.device,
+    rank: int,
+    world: int,
+) -> None:
+    """Trains on recordings (task -> file), from the start or from where `folder` was left.
+
+    The leader, of rank 0, logs, saves, evaluates and reports.
+    """
+    leader, tasks = rank == 0, list(paths)
+
+    # Demonstrations, the policy, its windows, and the state in which the run was left
     recordings = [load_demonstrations(paths[task]).take(settings.demonstrations) for task in tasks]
-
-    # The policy, its windows, and the state in which a run was left
-    config = choose_config(args, preset, recordings, bool(own))
+    config = choose_config(args, settings.preset, recordings, settings.suite == "own")
     samplers = {
         task: WindowSampler(d, config, device, settings.after_success, settings.augment)
         for task, d in zip(tasks, recordings)
     }
     policy, ema, optimizer = initialize(config, settings, samplers, device)
+    data = digest(samplers)
     left = {"step": 0, "seconds": 0.0, "text_weights": None}
-    if args.resume and (folder / "last.pt").exists():
-        left = restore(folder / "last.pt", policy, ema, optimizer, settings)
+    if args.resume:
+        left = restore(folder / "last.pt", policy, ema, optimizer, settings, data)
     start, seconds = left["step"], left["seconds"]
     said = [d.instruction for d in recordings]
     features, identity = text_features(said, args.clip_weights, left["text_weights"])
     text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
 
     # What is written beside the weights, and beside the results
-    about = dict(suite=suite, preset=preset, text_weights=identity, arguments=asdict(settings))
-    facts = {"text_weights": identity, **evaluate.report_facts("train.py", argv, device)}
-    rollouts = (settings.episodes, EVALUATION_SEED, args.workers, device, settings.demonstrations)
+    about = {"suite": settings.suite, "preset": settings.preset, "text_weights": identity}
+    about["arguments"] = asdict(settings)
+    facts = {"text_weights": identity, **facts}
     if leader and start == 0:
         written = {"arguments": asdict(settings), "config": asdict(config), **facts}
         evaluate.write_text(folder / "config.json", json.dumps(written, indent=1))
@@ -401,12 +437,28 @@ def main(argv: list[str] | None = None) -> None:
     def save_last() -> None:
         training = {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
         training["n_averaged"] = ema.n_averaged
-        now = {"step": step, "seconds": seconds, "training": training}
+        now = {"step": step, "seconds": seconds, "training": training, "data": data}
         save_checkpoint(folder / "last.pt", ema.module, **about, **now)
 
-    bar = {"desc": "training", "unit": "step", "dynamic_ncols": True, "disable": not leader}
+    def measure(step: int) -> evaluate.Successes | None:
+        """Evaluates the checkpoint of this step if that is due, unless it was done before."""
+        due = step == settings.steps or (step and step % settings.evaluate_every == 0)
+        if not leader or not settings.episodes or not due:
+            return None
+        if (successes := evaluate.logged_successes(folder, step)) is None:
+            stop.at_once = True  # everything is saved
+            protocol = (settings.episodes, EVALUATION_SEED, args.workers, device)
+            checkpoint, n = folder / f"ema-{step:05d}.pt", settings.demonstrations
+            successes = evaluate.evaluate(checkpoint, paths, text, *protocol, n)
+            stop.at_once = False
+            mean = evaluate.mean_success(successes)
+            evaluate.log(folder, step=step, success=mean, successes=successes)
+        return successes
+
+    bar = {"desc": "training", "unit": "step", "disable": not leader}
     bar |= {"total": settings.steps, "initial": start}
-    with evaluate.StopRequest() as stop, tqdm(**bar) as progress:
+    with evaluate.StopRequest() as stop, progress_bar(**bar) as progress:
+        measure(start)  # the run may have been stopped while it was measured
         began = saved = time.monotonic()
         for step, figures in meta_train(
             policy, ema, optimizer, samplers, text, settings, start, rank, world
@@ -418,39 +470,32 @@ def main(argv: list[str] | None = None) -> None:
                 figures["lr"] = optimizer.param_groups[0]["lr"]
                 evaluate.log(folder, step=step, **figures, seconds=round(seconds, 2))
 
-                final = step == settings.steps
-                milestone = final or step % settings.checkpoint_every == 0
+                milestone = step == settings.steps or step % settings.checkpoint_every == 0
                 if milestone:
                     checkpoint = folder / f"ema-{step:05d}.pt"
                     save_checkpoint(checkpoint, ema.module, **about, step=step, seconds=seconds)
-                    if settings.episodes and (final or step % settings.evaluate_every == 0):
-                        successes = evaluate.evaluate(checkpoint, paths, text, *rollouts)
-                        mean = evaluate.mean_success(successes)
-                        evaluate.log(folder, step=step, success=mean, successes=successes)
-                    evaluate.draw_curves(folder)
                 if milestone or stop.requested or time.monotonic() - saved > SAVE_SECONDS:
-                    save_last()  # after the evaluation: a run killed in it comes back to it
+                    save_last()
                     saved = time.monotonic()
 
             if stop.requested and step < settings.steps:
-                progress.close()
-                if leader:
-                    print(f"saved after step {step}: add --resume to go on", file=sys.stderr)
-                raise KeyboardInterrupt
+                raise KeyboardInterrupt(f"saved after step {step}, add --resume to go on")
+            if leader and milestone:
+                measure(step)
+                evaluate.draw_curves(folder)
             began = time.monotonic()
 
-    if world > 1:
-        dist.destroy_process_group()
-    if leader and settings.episodes and start < settings.steps:
-        facts |= {"title": f"{suite} base tasks, preset {preset}, step {settings.steps}"}
-        facts |= {"episodes a task": settings.episodes, "seed": EVALUATION_SEED}
+        successes = measure(settings.steps)
+
+    if successes:
+        title = f"{settings.suite}, base tasks, {settings.preset}, step {settings.steps}"
+        facts |= {"title": title, "episodes a task": settings.episodes, "seed": EVALUATION_SEED}
         facts |= {"training": f"{seconds / 60:.1f} min", "training seed": settings.seed}
-        report = evaluate.write_report(folder, {"last checkpoint": successes}, facts, suite)
-        print(f"\n{report}")
+        columns = {"last checkpoint": successes}
+        print(f"\n{evaluate.write_report(folder, columns, facts, settings.suite)}")
     if leader:
-        print(
-            f"\n{folder} is finished: {', '.join(sorted(path.name for path in folder.iterdir()))}"
-        )
+        files = ", ".join(sorted(path.name for path in folder.iterdir()))
+        print(f"\n{folder} is finished: {files}")
 
 
 if __name__ == "__main__":

@@ -47,10 +47,12 @@ def small_suite():
 @pytest.fixture
 def own_folder(tmp_path, monkeypatch):
     """The test runs in an empty folder, and leaves the process as it was."""
-    handler, threads = signal.getsignal(signal.SIGINT), torch.get_num_threads()
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    handlers, threads = [signal.getsignal(n) for n in numbers], torch.get_num_threads()
     monkeypatch.chdir(tmp_path)
     yield tmp_path
-    signal.signal(signal.SIGINT, handler)
+    for number, handler in zip(numbers, handlers):
+        signal.signal(number, handler)
     torch.set_num_threads(threads)
 
 

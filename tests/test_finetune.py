@@ -61,10 +61,12 @@ def test_finetuning_needs_only_a_task_and_reports_before_and_after(
     assert not torch.equal(policy["normalizer.state_scale"], old["normalizer.state_scale"])
     assert evaluate.SHIPPED_CHECKPOINT.stat().st_size < 16 * 2**20
 
-    before = fingerprint(folder)
-    message = fails(finetune, [*argv.split(), "--data", str(recorded)], capsys)
+    before, argv = fingerprint(folder), [*argv.split(), "--data", str(recorded)]
+    message = fails(finetune, argv, capsys)
     assert "already holds adapted.pt: add --overwrite" in message
     assert fingerprint(folder) == before
+    finetune.main([*argv, "--overwrite", "--episodes", "0", "--steps", "1"])
+    assert not list(folder.glob("success.*"))  # they were of the old policy
 
 
 def test_adaptation_is_repeatable_and_moves_only_what_has_a_learning_rate(run, recorded):
@@ -148,6 +150,19 @@ def test_demonstrations_that_do_not_fit_are_refused(run, capsys, changes, option
     argv = ["--data", "own.npz", "--checkpoint", run / "ema-00006.pt", "--steps", "1"]
     assert message in fails(finetune, [*argv, *options.split()], capsys)
     assert not list(Path().rglob("adapted.pt"))
+
+
+def test_a_recording_of_another_task_is_refused(run, recorded, capsys):
+    argv = adapting(run, recorded / "reach.npz", task="drawer-close")
+    message = fails(finetune, argv, capsys)
+    assert "is a recording of reach, not of drawer-close" in message
+
+
+@pytest.mark.parametrize("task", ["../../evil", "a/b", "", "x" * 10_000])
+def test_a_name_that_is_no_name_writes_nowhere(run, task, capsys):
+    np.savez("own.npz", **own_recording(task=task))
+    assert "is no name" in fails(finetune, ["--data", "own.npz"], capsys)
+    assert not Path("runs").exists()
 
 
 def test_an_adaptation_that_diverges_stops_and_writes_nothing(run, recorded, capsys):

@@ -7,7 +7,7 @@ import re
 import signal
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ import data
 import evaluate
 import finetune
 import model
+import simulator
 import train
 
 ROOT = Path(train.__file__).resolve().parent
@@ -160,15 +161,16 @@ def test_a_run_killed_between_savings_resumes_to_the_same_bits(run, recorded, tm
         assert {**whole, "seconds": 0} == {**resumed, "seconds": 0}
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_saves_says_how_to_resume_and_ends_with_130(
-    run, recorded, tmp_path, monkeypatch, capsys
+    run, recorded, tmp_path, monkeypatch, capsys, number
 ):
     log, out = evaluate.log, tmp_path / "interrupted"
 
     def log_and_interrupt(folder, **values):
         log(folder, **values)
         if values["step"] == 2:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
 
     monkeypatch.setattr(evaluate, "log", log_and_interrupt)
     argv = ["--data", str(recorded), "--out", str(out), *FEW]
@@ -180,6 +182,47 @@ def test_ctrl_c_saves_says_how_to_resume_and_ends_with_130(
     monkeypatch.setattr(evaluate, "log", log)
     train.main([*argv, "--resume"])
     assert same_bits(whole_state(out), whole_state(run))
+
+
+def test_a_run_stopped_while_it_is_measured_is_measured_when_resumed(
+    run, recorded, tmp_path, monkeypatch, capsys
+):
+    def stopped(*_):
+        signal.raise_signal(signal.SIGINT)
+
+    argv = [*FEW, *"--episodes 2 --evaluate-every 6".split(), "--data", str(recorded)]
+    argv += ["--out", str(tmp_path / "run")]
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluate, "evaluate", stopped)
+        with pytest.raises(SystemExit) as end:
+            data.command_line(lambda: train.main(argv))
+    assert end.value.code == 130 and weights(tmp_path / "run" / "last.pt")[1]["step"] == 6
+    assert not (tmp_path / "run" / "success.json").exists()
+    (tmp_path / "run" / ".123.last.pt").write_text("left by a killed process")
+
+    measured = {task: [True, False] for task in BASE}
+    monkeypatch.setattr(evaluate, "evaluate", lambda *_: measured)
+    train.main([*argv, "--resume"])
+    report = json.loads((tmp_path / "run" / "success.json").read_text())
+    assert report["successes"]["last checkpoint"] == measured
+    assert not list((tmp_path / "run").glob(".*"))
+    assert same_bits(whole_state(tmp_path / "run"), whole_state(run) | {"step": 6})
+
+
+def test_a_broken_pipe_does_not_end_the_work(monkeypatch):
+    class Broken:
+        def write(self, *text):
+            raise BrokenPipeError
+
+        flush = write
+
+    monkeypatch.setattr(sys, "stderr", Broken())
+    with simulator.progress_bar(total=2) as progress:
+        progress.update()
+        progress.set_postfix(loss="0")
+    with pytest.raises(SystemExit) as end:
+        data.command_line(lambda: (_ for _ in ()).throw(ValueError("x")))
+    assert end.value.code == 2
 
 
 WAYS = {
@@ -311,6 +354,34 @@ def test_an_existing_run_is_neither_overwritten_nor_resumed_with_other_settings(
     message = fails(train, [*argv, "--resume", "--demo-encoder", "mlp"], capsys)
     assert "demo_encoder vmt -> mlp" in message
     assert fingerprint(run) == before
+
+
+def test_what_cannot_be_resumed_is_said(run, recorded, tmp_path, capsys):
+    argv = ["--data", recorded, *FEW]
+    message = fails(train, [*argv, "--out", tmp_path / "mistyped", "--resume"], capsys)
+    assert "no run to resume" in message
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "ema-00003.pt").write_bytes(b"all that is left")
+    assert "already holds a run" in fails(train, [*argv, "--out", out], capsys)
+    with evaluate.locked(tmp_path / "busy"):
+        message = fails(train, [*argv, "--out", tmp_path / "busy"], capsys)
+    assert "another process runs in" in message
+    assert "no folder" in fails(train, ["--preset", "tiny", "--data", "misspelt"], capsys)
+    assert not Path("misspelt").exists()
+
+
+def test_a_run_is_not_resumed_on_other_recordings(recorded, tmp_path, capsys):
+    Path("own").mkdir()
+    for task in BASE:
+        demonstrations = data.load_demonstrations(recorded / f"{task}.npz")
+        data.save_demonstrations(f"own/{task}-mine.npz", demonstrations)
+    argv = ["--data", "own", *[word for word in FEW if word not in ("--suite", "ml10")]]
+    train.main([*argv, "--steps", "2", "--out", "run"])
+    shifted = replace(demonstrations, action=-demonstrations.action)
+    data.save_demonstrations(f"own/{task}-mine.npz", shifted)
+    message = fails(train, [*argv, "--steps", "2", "--out", "run", "--resume"], capsys)
+    assert "was started on other recordings" in message
 
 
 def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_last_good_state(

@@ -1,0 +1,64 @@
+"""A few of the cases of `python -m tests.fuzz`, with fixed seeds."""
+
+import pytest
+import torch
+
+import data
+import model
+from tests import fuzz
+
+
+def test_no_damage_to_a_checkpoint_goes_unnoticed(tmp_path):
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    model.save_checkpoint(tmp_path / "policy.pt", policy, step=1)
+    assert fuzz.fuzz_file(tmp_path / "policy.pt", fuzz.read_checkpoint, 200) > 180
+
+
+def test_no_damage_to_a_recording_goes_unnoticed(recorded, tmp_path):
+    small = data.load_demonstrations(recorded / "reach.npz").take(1)
+    data.save_demonstrations(tmp_path / "reach.npz", small)
+    assert fuzz.fuzz_file(tmp_path / "reach.npz", fuzz.read_recording, 200) > 180
+
+
+def test_weights_that_are_not_finite_are_not_saved(tmp_path):
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    with torch.no_grad():
+        policy.unet.head[1].weight[0] = torch.nan
+    with pytest.raises(ValueError, match="not finite"):
+        model.save_checkpoint(tmp_path / "policy.pt", policy)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"unet_widths": [2**20, 2**21]}, {"u2t_heads": 0}, {"demo_dim": 2**40}, {"state_dim": "x"}],
+)
+def test_an_edited_configuration_is_refused_before_memory_is_taken(tmp_path, changes):
+    path = tmp_path / "policy.pt"
+    model.save_checkpoint(path, model.DAMIPolicy(model.PRESETS["tiny"]))
+    content = torch.load(path, weights_only=True)
+    torch.save(content | {"config": content["config"] | changes}, path)
+    with pytest.raises(ValueError, match="do not fit"):
+        model.load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"noise": (2, 16, 1)},
+        {"timesteps": (1,)},
+        {"action": (2, 1, 4)},
+        {"state": (2, 2, 1)},
+        {"points": (2, 2, 8, 2)},
+        {"points": (2, 1, 8, 3)},
+    ],
+)
+def test_shapes_that_would_broadcast_are_refused(changes):
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    shapes = {"points": (2, 2, 8, 3), "state": (2, 2, 9), "action": (2, 16, 4), "noise": (2, 16, 4)}
+    batch = {name: torch.zeros(shape) for name, shape in (shapes | changes).items()}
+    batch["timesteps"] = torch.zeros(changes.get("timesteps", (2,)), dtype=torch.int64)
+    task = {"text": torch.zeros(1, 512), "demo_points": torch.zeros(1, 3, 8, 3)}
+    task |= {"demo_state": torch.zeros(1, 3, 9), "demo_action": torch.zeros(1, 3, 4)}
+    with pytest.raises(ValueError, match=next(iter(changes))):
+        policy.loss(**batch, **task)
