@@ -27,6 +27,7 @@ import argparse
 import json
 import math
 import os
+import random
 import select
 import socket
 import struct
@@ -36,7 +37,7 @@ import threading
 import time
 import tty
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,6 +102,8 @@ class Settings:
     max_step_m: float = 0.05  # a longer step of one action is a jump, and stops the arm
     max_step_rad: float = 0.2
     max_state_age_s: float = 0.1
+    max_lag_m: float = 0.03  # how far the arm may stay behind what it is told
+    max_lag_rad: float = 0.2
     max_hold_s: float = 2.0  # how long the arm waits in place for a late policy or camera
     servo_lookahead_s: float = 0.1
     servo_gain: float = 300.0
@@ -150,6 +153,8 @@ class Settings:
         }
         limits |= {
             "max_step_rad": 3.0,
+            "max_lag_m": 0.5,
+            "max_lag_rad": 3.0,
             "max_state_age_s": 1.0,
             "max_hold_s": 60,
             "num_points": 100_000,
@@ -221,13 +226,15 @@ OUTPUTS = (
     "runtime_state",
     "robot_status_bits",
     "safety_status_bits",
-    "output_int_register_24",
+    "output_int_register_24",  # the session that our program belongs to
+    "output_int_register_25",  # counts its turns
 )
-# Registers 0 to 23 belong to the fieldbus. Written in every package: the pose to go to, and FOLLOW
-# or STOP.
+# Registers 0 to 23 belong to the fieldbus. Written in every package: the pose to go to, and the
+# session's number, or STOP.
 INPUTS = (*(f"input_double_register_{24 + i}" for i in range(6)), "input_int_register_24")
-STOP, FOLLOW = 0, 1
+STOP = 0
 RUNNING = 7  # robot_mode
+PLAYING = 2  # runtime_state; of a paused program it is 4
 PROGRAM_RUNNING = 1 << 1  # of robot_status_bits
 SAFETY = {
     1: "normal",
@@ -264,6 +271,8 @@ class State(NamedTuple):
             return f"safety: {SAFETY.get(mode, mode)} (status bits {bits:#x})"
         if v["robot_mode"] != RUNNING:
             return f"the robot is not running (robot mode {v['robot_mode']}, {RUNNING} is running)"
+        if not np.isfinite(self.pose).all():
+            return "the pose of the TCP is not finite"
         return None
 
 
@@ -271,7 +280,8 @@ class RTDE:
     """A client of the controller's RTDE interface, protocol version 2: one recipe each way.
 
     A thread keeps the newest state. Nothing is connected again by itself: after a loss, make a new
-    one. `send` and `stop` write the inputs; after `stop` nothing is ever sent.
+    one. `send` and `stop` write the inputs; after `stop` nothing is ever sent. A program that was
+    made for this `session` follows them, and no other does.
 
     Raises RobotError: refused version, a field NOT_FOUND or IN_USE, no answer, lost connection,
     lost framing.
@@ -287,6 +297,8 @@ class RTDE:
     ):
         self.name = f"RTDE at {host}:{port}"
         self.buffer, self.newest, self.error, self.stopped = b"", None, None, False
+        self.session = random.SystemRandom().randrange(1, 2**31)
+        self.rotation: np.ndarray | None = None  # the rotation vector sent last
         self.lock, self.arrived = threading.Lock(), threading.Condition()
         try:
             self.socket = socket.create_connection((host, port), timeout)
@@ -332,8 +344,7 @@ class RTDE:
         return reply[0], struct.Struct(">" + "".join(FORMATS[kind] for kind in types))
 
     def package(self) -> tuple[int, bytes]:
-        """The next package's type and payload, however the bytes were split or joined on their "
-        "way."""
+        """The next package's type and payload, however the bytes were split or joined."""
         while True:
             if len(self.buffer) >= HEADER.size:
                 size, kind = HEADER.unpack_from(self.buffer)
@@ -412,7 +423,7 @@ class RTDE:
         """
         with self.lock:
             if not self.stopped:
-                self.write(pose, FOLLOW)
+                self.write(pose, self.session)
             return not self.stopped
 
     def stop(self, pose: np.ndarray) -> None:
@@ -423,11 +434,20 @@ class RTDE:
                 self.write(pose, STOP)
 
     def write(self, pose: np.ndarray, command: int) -> None:
+        if self.rotation is not None:  # no jump by 2 pi between two packages
+            pose = np.concatenate([pose[:3], nearer(pose[3:], self.rotation)])
+        self.rotation = pose[3:]
         payload = bytes([self.input_recipe]) + self.input_format.pack(*map(float, pose), command)
         try:
             self.socket.sendall(HEADER.pack(HEADER.size + len(payload), DATA) + payload)
         except OSError as error:
             raise RobotError(f"{self.name}: connection lost: {error}") from None
+
+    def program_runs(self, state: State) -> bool:
+        """Whether the program of this session runs, and is not paused."""
+        v = state.values
+        playing = v["robot_status_bits"] & PROGRAM_RUNNING and v["runtime_state"] == PLAYING
+        return playing and v["output_int_register_24"] == self.session
 
     def close(self) -> None:
         try:
@@ -440,42 +460,65 @@ class RTDE:
 
 # ---- Dashboard and programs on the controller ----------------------------------------------------
 
-# Runs on the controller. It ends when told to, when RTDE is late (the watchdog), or when no inverse
-# kinematics is found.
-SERVO_PROGRAM = """def dami_servo():
+# Both programs run on the controller. They end when told to, when RTDE is late (the watchdog, so
+# that no arm moves or stays free whose computer is gone), or when no inverse kinematics is found.
+# The session says whose they are, the counter that they still run. The watchdog rests before the
+# arm is braked: nobody writes any more, and it would cut the braking short.
+PROGRAM = """def dami():
   rtde_set_watchdog("input_int_register_24", {watchdog_hz:.1f}, "stop")
-  write_output_integer_register(24, 1)
-  while read_input_integer_register(24) == 1:
-    pose = p[{registers}]
-    q = get_inverse_kin(pose, get_actual_joint_positions())
-    servoj(q, t={period:.4f}, lookahead_time={lookahead:.3f}, gain={gain:.0f})
-  end
-  stopj(2.0)
+  write_output_integer_register(24, {session})
+  n = 0
+{before}  while read_input_integer_register(24) == {session}:
+    n = n + 1
+    write_output_integer_register(25, n)
+{turn}  end
+  rtde_set_watchdog("input_int_register_24", 0.1, "ignore")
+{after}  stopj(2.0)
   write_output_integer_register(24, 0)
 end
 """
-FREEDRIVE_PROGRAM = """def dami_freedrive():
-  freedrive_mode()
-  while True:
-    sync()
-  end
-end
-"""
-END_PROGRAM = """def dami_end():
-  end_freedrive_mode()
-  stopj(2.0)
-end
+FREEDRIVE = ("  freedrive_mode()\n", "    sync()\n", "  end_freedrive_mode()\n")
+SERVO = """    pose = p[{registers}]
+    q = get_inverse_kin(pose, get_actual_joint_positions())
+    servoj(q, t={period:.4f}, lookahead_time={lookahead:.3f}, gain={gain:.0f})
 """
 
 
-def servo_program(settings: Settings) -> str:
-    return SERVO_PROGRAM.format(
-        watchdog_hz=settings.servo_hz / 10,
+def servo_turn(settings: Settings) -> str:
+    """What the servo program does in each turn."""
+    return SERVO.format(
         registers=", ".join(f"read_input_float_register({24 + i})" for i in range(6)),
         period=1 / settings.servo_hz,
         lookahead=settings.servo_lookahead_s,
         gain=settings.servo_gain,
     )
+
+
+def start_program(
+    rtde: RTDE, settings: Settings, host: str, before: str, turn: str, after: str
+) -> State:
+    """Starts a program of this session and waits until it runs; preloads the actual pose.
+
+    Returns the state in which it runs. Raises RobotError if the arm must not be moved, or the
+    program does not start.
+    """
+    state = rtde.state(settings.max_state_age_s)
+    if trouble := state.trouble():
+        raise RobotError(f"the arm is not moved: {trouble}")
+    pose, watchdog_hz, session = state.pose, settings.servo_hz / 10, rtde.session
+    rtde.send(pose)
+    text = PROGRAM.format(
+        watchdog_hz=watchdog_hz, session=session, before=before, turn=turn, after=after
+    )
+    upload(host, settings.script_port, text)
+    deadline = time.monotonic() + 5
+    while not rtde.program_runs(state := rtde.state(settings.max_state_age_s)):
+        if time.monotonic() > deadline:
+            hint = "the program does not start: is the robot in remote control?"
+            raise RobotError(f"{hint} ({state.trouble()})")
+        rtde.send(pose)
+        time.sleep(1 / settings.servo_hz)
+    return state
 
 
 def upload(host: str, port: int, program: str) -> None:
@@ -817,8 +860,12 @@ class Servo:
     When all targets are reached it holds the last one. It stops for good, and says why, when
 
     - the newest state is older than `max_state_age_s`, or the connection or its framing is lost;
-    - the robot is not running, its safety mode is neither normal nor reduced, or its program no
-    longer runs;
+    - the robot is not running, its safety mode is neither normal nor reduced, or our program is
+    paused, has ended, or no longer counts (another has taken its place);
+    - the controller's clock stands still or runs backwards;
+    - the arm is farther than `max_lag_m` or `max_lag_rad` from where it was told to be: blocked, or
+    slowed by the speed slider;
+    - it begins outside the box;
     - an action has the wrong shape, NaN, or a jump; a target lies outside the box (unless
     `outside_box` is "clamp");
     - no new targets come for `max_hold_s`, since the policy is too slow or the camera gives
@@ -836,37 +883,51 @@ class Servo:
             "the policy or the camera is too slow",
         )  # why it holds
         self.lock, self.error, self.ended = threading.Lock(), None, threading.Event()
+        self.changed: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
         self.lateness, self.ages, self.clamped = [], [], False
 
     def start(self, host: str) -> None:
-        """Preloads the actual pose, starts the program on the controller, waits until it runs, and
-        begins to stream.
-        """
+        """Starts the program on the controller where the arm now is, and begins to stream."""
         settings = self.settings
-        if trouble := self.rtde.state(settings.max_state_age_s).trouble():
+        state = self.rtde.state(settings.max_state_age_s)
+        if trouble := state.trouble():
             raise RobotError(f"the arm is not moved: {trouble}")
+        if not self.holds(state.pose):
+            where = ", ".join(f"{x:.3f}" for x in state.pose[:3])
+            raise RobotError(f"the TCP is outside its box, at {where} m: move it inside first")
+        self.pose = state.pose  # not an older one: the arm may have been moved meanwhile
         if self.moves:
-            self.rtde.send(self.pose)
-            upload(host, settings.script_port, servo_program(settings))
-            deadline = time.monotonic() + 5
-            while not self.program_runs(state := self.rtde.state(settings.max_state_age_s)):
-                if time.monotonic() > deadline:
-                    raise RobotError(
-                        "the servo program does not start: is the robot in remote control? "
-                        f"({state.trouble()})"
-                    )
-                self.rtde.send(self.pose)
-                time.sleep(1 / settings.servo_hz)
+            self.pose = start_program(self.rtde, settings, host, "", servo_turn(settings), "").pose
         self.held_since = time.monotonic()
         self.thread = threading.Thread(target=self.stream, name="servo", daemon=True)
         self.thread.start()
 
-    @staticmethod
-    def program_runs(state: State) -> bool:
-        return (
-            state.values["robot_status_bits"] & PROGRAM_RUNNING
-            and state.values["output_int_register_24"] == 1
-        )
+    def holds(self, pose: np.ndarray) -> bool:
+        """Whether the TCP's box holds a pose."""
+        low, high = self.settings.tcp_low_m, self.settings.tcp_high_m
+        return bool(((pose[:3] >= low) & (pose[:3] <= high)).all())
+
+    def stale(self, state: State, now: float) -> str | None:
+        """What in the state should change all the time and does not; None if all does."""
+        watched = {"the controller's clock": state.values["timestamp"]}
+        if self.moves:
+            watched["the count of our program"] = state.values["output_int_register_25"]
+        for name, value in watched.items():
+            old, since = self.changed.get(name, (value, now))
+            if value < old:
+                return f"{name} runs backwards"
+            if now - since > 2 * self.settings.max_state_age_s:
+                return f"{name} stands still"
+            self.changed[name] = (value, now if value > old else since)
+        return None
+
+    def lag(self, state: State) -> str | None:
+        """Why the arm does not follow, if it does not."""
+        settings, behind = self.settings, difference(state.pose, self.pose)
+        metres, radians = np.linalg.norm(behind[:3]), np.linalg.norm(behind[3:])
+        if metres <= settings.max_lag_m and radians <= settings.max_lag_rad:
+            return None
+        return f"the arm is {metres:.3f} m, {radians:.3f} rad behind: blocked, or slowed down"
 
     def follow(self, actions: np.ndarray) -> None:
         """Takes relative actions (n, 7), one every 1 / policy_hz from now on; raises RobotError for
@@ -898,12 +959,12 @@ class Servo:
 
     def inside(self, pose: np.ndarray) -> np.ndarray:
         """The pose if the TCP's box holds it; else stops, or clamps it, as the settings say."""
-        low, high = np.array(self.settings.tcp_low_m), np.array(self.settings.tcp_high_m)
-        if ((pose[:3] >= low) & (pose[:3] <= high)).all():
+        if self.holds(pose):
             return pose
         if self.settings.outside_box == "stop":
             self.fail(f"a target lies outside the box: {', '.join(f'{x:.3f}' for x in pose[:3])} m")
         self.clamped = True
+        low, high = self.settings.tcp_low_m, self.settings.tcp_high_m
         return np.concatenate([pose[:3].clip(low, high), pose[3:]])
 
     def check(self) -> None:
@@ -923,8 +984,7 @@ class Servo:
             pass  # the connection is lost: the watchdog on the controller stops the arm
 
     def tick(self, now: float) -> np.ndarray:
-        """The pose to command now: toward the next target, on time for it, no faster than "
-        "allowed."""
+        """The pose to command now: toward the next target, on time, no faster than allowed."""
         settings, dt = self.settings, 1 / self.settings.servo_hz
         with self.lock:
             while len(self.targets) > 1 and self.targets[0][0] <= now:
@@ -942,17 +1002,19 @@ class Servo:
             return self.pose
 
     def stream(self) -> None:
-        """The thread: one package every 1 / servo_hz, until something is wrong or `stop` is "
-        "called."""
+        """The thread: a package every 1 / servo_hz, until something is wrong or `stop` comes."""
         period, settings = 1 / self.settings.servo_hz, self.settings
         due = time.monotonic()
         while not self.ended.is_set() and self.error is None:
             try:
                 state = self.rtde.state(settings.max_state_age_s)
                 trouble = state.trouble()
-                if trouble is None and self.moves and not self.program_runs(state):
-                    trouble = "the program on the controller has ended"
                 now = time.monotonic()
+                if trouble is None and self.moves and not self.rtde.program_runs(state):
+                    trouble = "the program on the controller has ended, or is paused"
+                if trouble is None and self.moves:
+                    trouble = self.lag(state)
+                trouble = trouble or self.stale(state, now)
                 if trouble is None and now - self.held_since > settings.max_hold_s:
                     trouble = f"no new actions for {settings.max_hold_s:g} s: {self.missing}"
                 if trouble is not None:
@@ -1066,10 +1128,11 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
     with connect(args, settings, write=not args.dry_run) as cell:
         servo = Servo(cell.rtde, settings, moves=not args.dry_run)
         try:
-            frames = [cell.observe()] * config.n_obs_steps
+            cell.observe()  # camera, gripper and arm answer, before anything moves
             if not args.dry_run:
                 cell.gripper.initialize()
             servo.start(args.host)
+            frames = [cell.wait_for_observation(servo)] * config.n_obs_steps
             print(
                 f"{demonstrations.task}: running{' without motion' if args.dry_run else ''}; "
                 "Ctrl-C stops",
@@ -1166,6 +1229,13 @@ def to_demonstrations(
     return Demonstrations(task, instruction, *arrays, meta)
 
 
+def keep_free(rtde: RTDE, settings: Settings) -> None:
+    """The thread that keeps the arm free: without it the watchdog on the controller ends that."""
+    with suppress(RobotError):  # the connection is lost: the watchdog does it
+        while rtde.send(rtde.state(settings.max_state_age_s).pose):
+            time.sleep(1 / settings.servo_hz)
+
+
 def record(args: argparse.Namespace, settings: Settings) -> None:
     """Records demonstrations by hand guidance: the arm is free to be moved, keys begin and end an
     episode.
@@ -1179,13 +1249,12 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
         "policy_hz": settings.policy_hz,
         "num_points": settings.num_points,
     }
-    with connect(args, settings, write=False) as cell, Keys() as keys:
+    with connect(args, settings, write=not args.dry_run) as cell, Keys() as keys:
         cell.observe()  # camera, gripper and arm answer, before anything is set free
         if not args.dry_run:
-            if trouble := cell.rtde.state(settings.max_state_age_s).trouble():
-                raise RobotError(f"the arm is not set free: {trouble}")
             cell.gripper.initialize()
-            upload(args.host, settings.script_port, FREEDRIVE_PROGRAM)
+            start_program(cell.rtde, settings, args.host, *FREEDRIVE)
+            threading.Thread(target=keep_free, args=(cell.rtde, settings), daemon=True).start()
         print(
             "keys: s starts an episode, e ends and keeps it, d drops it, g opens or closes the "
             "gripper, q quits",
@@ -1217,7 +1286,11 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
                     episode = None
                 elif key == "q":
                     break
-                if trouble := cell.rtde.state(settings.max_state_age_s).trouble():
+                state = cell.rtde.state(settings.max_state_age_s)
+                trouble = state.trouble()
+                if trouble is None and not args.dry_run and not cell.rtde.program_runs(state):
+                    trouble = "the arm is no longer free: the program on the controller has ended"
+                if trouble:
                     raise RobotError(
                         f"{trouble}; the episode at hand is dropped, {len(episodes)} are in {out}"
                     )
@@ -1227,7 +1300,7 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
                 time.sleep(max(0.0, due - time.monotonic()))
         finally:
             if not args.dry_run:
-                upload(args.host, settings.script_port, END_PROGRAM)
+                cell.rtde.stop(cell.rtde.newest.pose)
     print(f"{len(episodes)} episodes in {out}" if episodes else "nothing was recorded")
 
 

@@ -65,6 +65,9 @@ class Faults:
     robot_mode: int = 7
     lose_program: bool = False  # the program ends
     no_program: bool = False  # programs are taken and not started
+    blocked: bool = False  # the arm stands, whatever it is told
+    paused: bool = False  # the program is paused at the panel
+    frozen: bool = False  # the same state again and again
     gripper_bad_crc: int = 0  # so many answers
     gripper_silent: int = 0
     gripper_exception: int = 0
@@ -82,7 +85,7 @@ class Emulator:
         hand: float = 0.0,
     ):
         self.faults, self.lock = Faults(), threading.RLock()
-        self.ended = threading.Event()
+        self.ended, self.clock = threading.Event(), time.monotonic()
         self.pose, self.speed, self.free = list(START_POSE), [0.0] * 6, False
         self.inputs = {name: 0 if kind == "INT32" else 0.0 for name, kind in INPUT_TYPES.items()}
         self.outputs = {name: 0 for name in TYPES if name.startswith("output_")}
@@ -157,7 +160,7 @@ class Emulator:
             ]
         share = 1 - math.exp(-dt / ARM_SECONDS)
         before = list(self.pose)
-        if target is not None:
+        if target is not None and not self.faults.blocked:
             self.pose = [p + share * (t - p) for p, t in zip(self.pose, target)]
         self.speed = [(p - b) / dt for p, b in zip(self.pose, before)]
         self.opening += (1 - math.exp(-dt / GRIPPER_SECONDS)) * (
@@ -178,17 +181,22 @@ class Emulator:
             p["watchdog"]
             and time.monotonic() - self.written.get(p["watchdog"], p["began"]) > 1 / p["hz"]
         )
-        if p["kind"] == "freedrive":
-            if stopped:
-                self.program, self.free = None, False
+        if p["kind"] == "foreign":
+            self.program = None if stopped else p
+            return None
+        if self.faults.paused:
             return None
         ended = self.inputs[p["while"]] != p["value"]
         if stopped or late or ended:
-            self.program = None
+            self.program, self.free = None, False
             if not stopped and not late:
                 self.outputs[p["state"]] = 0  # the line after the loop
             return None
-        self.outputs[p["state"]] = 1
+        self.outputs[p["state"]] = p["value"]
+        self.outputs[p["counter"]] += 1
+        self.free = p["kind"] == "freedrive"
+        if self.free:
+            return None
         return [self.inputs[name] for name in p["pose"]]
 
     # ---- Script port
@@ -203,24 +211,25 @@ class Emulator:
             self.program, self.free = None, False
             if self.faults.no_program or not re.match(r"def \w+\(\):\n(  .*\n)+end\n$", program):
                 return
-            if "freedrive_mode()" in program and "end_freedrive_mode()" not in program:
-                self.program, self.free, self.began = (
-                    {"kind": "freedrive", "watchdog": None},
-                    True,
-                    time.monotonic(),
-                )
+            self.program = {"kind": "foreign", "watchdog": None}
             loop = re.search(r"while read_input_integer_register\((\d+)\) == (\d+):", program)
             pose = re.search(r"p\[(.*)\]", program)
-            if loop and pose and "get_inverse_kin(pose" in program and "servoj(q, t=" in program:
+            servo = pose and "get_inverse_kin(pose" in program and "servoj(q, t=" in program
+            free = "  freedrive_mode()\n" in program and "  end_freedrive_mode()\n" in program
+            if loop and (servo or free):
                 watchdog = re.search(r'rtde_set_watchdog\("(\w+)", ([\d.]+), "stop"\)', program)
-                state = re.search(r"write_output_integer_register\((\d+), 1\)", program)
+                state = re.search(rf"write_output_integer_register\((\d+), {loop[2]}\)", program)
+                counter = re.search(r"write_output_integer_register\((\d+), n\)", program)
+                self.began = time.monotonic()
+                self.outputs[f"output_int_register_{counter[1]}"] = 0
                 self.program = {
-                    "kind": "servo",
+                    "kind": "servo" if servo else "freedrive",
+                    "counter": f"output_int_register_{counter[1]}",
                     "while": f"input_int_register_{loop[1]}",
                     "value": int(loop[2]),
                     "pose": [
                         f"input_double_register_{n}"
-                        for n in re.findall(r"float_register\((\d+)\)", pose[1])
+                        for n in re.findall(r"float_register\((\d+)\)", pose[1] if pose else "")
                     ],
                     "watchdog": watchdog and watchdog[1],
                     "hz": watchdog and float(watchdog[2]),
@@ -252,14 +261,14 @@ class Emulator:
         if name in self.outputs:
             return self.outputs[name]
         return {
-            "timestamp": time.monotonic() - self.began,
+            "timestamp": 1.0 if faults.frozen else time.monotonic() - self.clock,
             "target_q": tuple(angle),
             "actual_q": tuple(angle),  # no kinematics here
             "actual_TCP_pose": tuple(self.pose),
             "actual_TCP_speed": tuple(self.speed),
             "robot_mode": faults.robot_mode,
             "safety_mode": faults.safety_mode,
-            "runtime_state": 2 if self.program else 1,
+            "runtime_state": 4 if self.faults.paused else 2 if self.program else 1,
             "robot_status_bits": 0b1 | (0b10 if self.program else 0),
             "safety_status_bits": faults.safety_status_bits,
             "speed_scaling": 1.0,
