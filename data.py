@@ -182,10 +182,12 @@ TURN = math.radians(10)  # about the vertical, at most
 STRETCH = 0.1  # share of shear and stretch, at most
 
 
-def draw_affine_maps(n: int, middle: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def draw_affine_maps(
+    n: int, middle: Tensor, generator: torch.Generator, mirror: bool = False
+) -> tuple[Tensor, Tensor]:
     """Draws n affine maps of space, x -> x A^T + b: a shear and stretch, a turn, a shift.
 
-    The turn is about the vertical through `middle` (1, 3), metres. Returns A (n, 3, 3) and
+    The turn is about the vertical through `middle` (1, 3), metres; `mirror` reverses x. Returns A (n, 3, 3) and
     b (n, 1, 3), float32.
     """
 
@@ -197,6 +199,8 @@ def draw_affine_maps(n: int, middle: Tensor, generator: torch.Generator) -> tupl
     cos, sin = angle.cos(), angle.sin()
     turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1).view(n, 3, 3)
     a = turn @ (torch.eye(3) + STRETCH * symmetric(n, 3, 3))
+    if mirror:
+        a = a * torch.tensor([-1.0, 1.0, 1.0])
     b = middle - middle @ a.mT + torch.tensor(SHIFT) * symmetric(n, 3)[:, None]
     return a, b
 
@@ -251,7 +255,7 @@ class WindowSampler:
         )  # (1, 3) turned about
 
         successes = meta.get("success_frames", []) if after_success is not None else []
-        windows = []
+        windows, counts = [], []
         for episode, success in zip_longest(self.episodes, successes[: len(self.episodes)]):
             earliest = episode.start - (config.n_obs_steps - 1)
             latest = max(episode.stop - config.horizon + config.n_action_steps - 1, earliest)
@@ -259,7 +263,9 @@ class WindowSampler:
                 latest = min(latest, episode.start + success + after_success)
             frames = torch.arange(earliest, latest + 1)[:, None] + torch.arange(config.horizon)
             windows.append(frames.clamp(episode.start, episode.stop - 1))  # (windows, H)
+            counts.append(len(frames))
         self.windows = torch.cat(windows).to(device)  # (W, H) the frame of each action
+        self.episode_of = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))  # (W,)
         self.undoing = self.undo_actions() if self.known_positions else None
 
     def check_fit(self, demonstrations: Demonstrations) -> None:
@@ -298,17 +304,25 @@ class WindowSampler:
         return len(self.windows)
 
     def sample(
-        self, n: int, generator: torch.Generator, backwards: bool = False
+        self,
+        n: int,
+        generator: torch.Generator,
+        backwards: bool = False,
+        without: int = -1,
     ) -> dict[str, Tensor]:
         """Draws n different windows (with repetition only where there are fewer than n).
 
+        None is of the episode `without`, unless that is the only one.
         Returns points (n, To, N, 3), state (n, To, S), action (n, H, A), all float32.
         """
-        if n <= len(self):
-            chosen = torch.randperm(len(self), generator=generator, device=generator.device)[:n]
+        others = (self.episode_of != without).nonzero()[:, 0]
+        others = others if len(others) else torch.arange(len(self))
+        count, device = len(others), generator.device
+        if n <= count:
+            chosen = torch.randperm(count, generator=generator, device=device)[:n]
         else:
-            chosen = torch.randint(len(self), (n,), generator=generator, device=generator.device)
-        return self.gather(chosen, backwards)
+            chosen = torch.randint(count, (n,), generator=generator, device=device)
+        return self.gather(others[chosen.cpu()], backwards)
 
     def gather(self, indices: Tensor, backwards: bool = False) -> dict[str, Tensor]:
         """Returns the windows of these indices (n,), as `sample` does."""
@@ -321,17 +335,17 @@ class WindowSampler:
             "action": (self.undoing if backwards else self.action)[frames],  # (n, H, A)
         }
 
-    def demonstration(
-        self, episode: torch.Generator | int, backwards: bool = False
-    ) -> dict[str, Tensor]:
-        """Returns a complete episode, drawn or named by its number, every demo_stride-th frame.
+    def draw_episode(self, generator: torch.Generator) -> int:
+        """Draws the number of an episode."""
+        n, device = len(self.episodes), generator.device
+        return int(torch.randint(n, (1,), generator=generator, device=device))
+
+    def demonstration(self, episode: int, backwards: bool = False) -> dict[str, Tensor]:
+        """Returns a complete episode, every demo_stride-th frame of it.
 
         Returns demo_points (1, T, N, 3), demo_state (1, T, S), demo_action (1, T, A), all float32:
         what `DAMIPolicy.encode_demo` takes.
         """
-        if isinstance(episode, torch.Generator):
-            count, device = len(self.episodes), episode.device
-            episode = int(torch.randint(count, (1,), generator=episode, device=device))
         whole = self.episodes[episode]
         frames = torch.arange(whole.start, whole.stop, self.config.demo_stride)
         frames = frames.flip(0) if backwards else frames
@@ -342,22 +356,28 @@ class WindowSampler:
         }
 
     def batch(
-        self, n: int, generator: torch.Generator, backwards: bool = False
+        self, n: int, generator: torch.Generator, backwards: bool = False, mirror: bool = False
     ) -> dict[str, Tensor]:
-        """Draws n windows and one reference demonstration, which may be one that a window is from.
+        """Draws one reference demonstration, and n windows of other episodes.
 
         `backwards` plays both from their last frame to the first, with actions that undo: another
-        task in the same scene. Returns what `sample` and `demonstration` do.
+        task in the same scene. `mirror` exchanges left and right in both.
+        Returns what `sample` and `demonstration` do.
         """
-        demo = self.demonstration(generator, backwards)
-        windows = self.sample(n, generator, backwards)
+        reference = self.draw_episode(generator)
+        demo = self.demonstration(reference, backwards)
+        windows = self.sample(n, generator, backwards, without=reference)
         if self.positions:
-            demo = self.augment(demo, generator, prefix="demo_")
-            windows = self.augment(windows, generator)
+            demo = self.augment(demo, generator, mirror, prefix="demo_")
+            windows = self.augment(windows, generator, mirror)
         return windows | demo
 
     def augment(
-        self, scenes: dict[str, Tensor], generator: torch.Generator, prefix: str = ""
+        self,
+        scenes: dict[str, Tensor],
+        generator: torch.Generator,
+        mirror: bool = False,
+        prefix: str = "",
     ) -> dict[str, Tensor]:
         """Moves each of n scenes elsewhere: points (n, T, N, 3), state (n, T, S), action (n, ., A).
 
@@ -366,7 +386,7 @@ class WindowSampler:
         """
         names = [f"{prefix}{part}" for part in ("points", "state", "action")]
         points, state, action = (scenes[name] for name in names)
-        a, b = draw_affine_maps(len(points), self.middle, generator)
+        a, b = draw_affine_maps(len(points), self.middle, generator, mirror)
         a, b = a.to(points.device), b.to(points.device)
 
         def place(x: Tensor) -> Tensor:

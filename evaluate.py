@@ -228,7 +228,7 @@ def rollout(
 
     # One reference demonstration a rollout, held. All are drawn before any noise is; they are
     # encoded one at a time, since they may differ in length.
-    demos = [sampler.demonstration(generator) for _ in envs]
+    demos = [sampler.demonstration(sampler.draw_episode(generator)) for _ in envs]
     if blank:
         demos = [{name: torch.zeros_like(x) for name, x in demo.items()} for demo in demos]
     with torch.no_grad():

@@ -83,6 +83,7 @@ class Settings(Flags):
     backwards: float = setting(
         0.0, "share played backwards, without instruction: other tasks", least=0, most=1
     )
+    mirror: float = setting(0.0, "share mirrored, without instruction", least=0, most=1)
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
@@ -124,6 +125,7 @@ def task_batch(
     seed: tuple[int, ...],
     instruction_dropout: float = 0.0,
     backwards: float = 0.0,
+    mirror: float = 0.0,
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
@@ -135,11 +137,12 @@ def task_batch(
     """
     first, second = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     generator = torch.Generator().manual_seed(int(first))
-    drop, turn = torch.rand(2, generator=torch.Generator().manual_seed(int(second)))
+    drop, turn, flip = torch.rand(3, generator=torch.Generator().manual_seed(int(second)))
     back = bool(turn < backwards) and sampler.undoing is not None
-    if back or drop < instruction_dropout:
+    mirrored = bool(flip < mirror) and sampler.positions > 0
+    if back or mirrored or drop < instruction_dropout:
         text = torch.zeros_like(text)
-    windows = sampler.batch(n, generator, back)
+    windows = sampler.batch(n, generator, back, mirrored)
     return {"text": text[None], **windows, **policy.draw_noise_and_timesteps(n, generator)}
 
 
@@ -198,7 +201,7 @@ def meta_train(
     params = dict(policy.named_parameters())
     my_tasks = list(enumerate(samplers))[rank::world]
     n = settings.support + settings.query
-    hidden = settings.instruction_dropout, settings.backwards
+    hidden = settings.instruction_dropout, settings.backwards, settings.mirror
     lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
     at_once = settings.vectorize if len(lengths) == 1 else 1  # stacking needs equal lengths
     multi_task_share = 1.0 if settings.maml == "off" else settings.multi_task_share
