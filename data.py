@@ -5,28 +5,24 @@
 Nothing here knows a simulator or a robot: simulator.py and robot.py record, and so may you. A file
 is checked when it is read (`Demonstrations.validate`), `WindowSampler` holds it as tensors, and its
 `batch` draws what `DAMIPolicy.loss` takes. The file imports nothing from the project and can be
-copied out alone. Its last two sections, settings and command lines, serve all scripts.
+copied out alone.
 
 Letters: W windows, T demonstration frames, F stored frames, N points, E episodes, H = 16 horizon,
 To = 2 observation steps, Ta = 8 executed actions, A action dim, S state dim, M points to sample.
 """
 
 import argparse
-import difflib
 import json
 import math
 import os
 import re
-import signal
 import sys
-import warnings
 import zipfile
-from collections.abc import Callable, Iterable
-from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import fpsample
 import numpy as np
@@ -131,6 +127,17 @@ class Demonstrations:
         return None
 
 
+def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
+    """Calls `write` with a temporary name beside `path`, then renames: whole, or the old file."""
+    path = Path(path)
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # with its suffix: some go by it
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 PARTS = [part.name for part in fields(Demonstrations)]
 
 
@@ -187,8 +194,8 @@ def draw_affine_maps(
 ) -> tuple[Tensor, Tensor]:
     """Draws n affine maps of space, x -> x A^T + b: a shear and stretch, a turn, a shift.
 
-    The turn is about the vertical through `middle` (1, 3), metres; `mirror` reverses x. Returns A (n, 3, 3) and
-    b (n, 1, 3), float32.
+    The turn is about the vertical through `middle` (1, 3), metres; `mirror` reverses x.
+    Returns A (n, 3, 3) and b (n, 1, 3), float32.
     """
 
     def symmetric(*shape: int) -> Tensor:
@@ -304,11 +311,7 @@ class WindowSampler:
         return len(self.windows)
 
     def sample(
-        self,
-        n: int,
-        generator: torch.Generator,
-        backwards: bool = False,
-        without: int = -1,
+        self, n: int, generator: torch.Generator, backwards: bool = False, without: int = -1
     ) -> dict[str, Tensor]:
         """Draws n different windows (with repetition only where there are fewer than n).
 
@@ -437,92 +440,7 @@ def draw_demonstration(
     write_atomically(out, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
 
 
-# ---- Settings: each said once, as a field --------------------------------------------------------
-
-
-def setting(default: Any, help: str, **bounds: Any) -> Any:
-    """A field of `Flags`: its default, its line of help, and its bounds: least, most, choices."""
-    return field(default=default, metadata={"help": help, **bounds})
-
-
-class Flags:
-    """Base of a frozen dataclass whose fields, made by `setting`, are flags of a script."""
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            largest = sys.float_info.max if isinstance(value, float) else sys.maxsize
-            least, most = f.metadata.get("least", -math.inf), f.metadata.get("most", largest)
-            if isinstance(value, (int, float)) and not least <= value <= most:
-                limit = f"at most {most}" if value > most else f"at least {least}"
-                raise ValueError(f"--{f.name.replace('_', '-')} is {value}: use {limit}")
-
-    @classmethod
-    def add_flags(cls, parser: Any) -> None:
-        """Adds a flag for each field; one that is not given is None."""
-        for f in fields(cls):
-            kind = next((t for t in get_args(f.type) if t is not type(None)), f.type)
-            if kind is bool:
-                options = {"action": argparse.BooleanOptionalAction}
-            else:
-                options = {"type": kind, "choices": f.metadata.get("choices")}
-            parser.add_argument(f"--{f.name.replace('_', '-')}", help=f.metadata["help"], **options)
-
-    def given(self, args: argparse.Namespace, **more: Any) -> Any:
-        """Returns these settings with what was given on the command line, and `more`."""
-        flags = {f.name: getattr(args, f.name) for f in fields(self)} | more
-        return replace(self, **{name: value for name, value in flags.items() if value is not None})
-
-
 # ---- Command lines -------------------------------------------------------------------------------
-
-
-def choose(name: str, names: Iterable[str], what: str) -> str:
-    """Returns `name` if it is one of `names`; otherwise ValueError with the nearest right one."""
-    names = sorted(names)
-    if name in names:
-        return name
-    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.4)
-    advice = f"did you mean {near[0]!r}?" if near else f"choose one of: {', '.join(names)}"
-    raise ValueError(f"unknown {what} {name!r}: {advice}")
-
-
-def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
-    """Calls `write` with a temporary name beside `path`, then renames: whole, or the old file."""
-    path = Path(path)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # with its suffix: some go by it
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def command_line(main: Callable[[], None], *errors: type[Exception]) -> None:
-    """Runs a script's `main`: what a user can cause ends in one line on stderr and exit code 2.
-
-    That is ValueError, OSError and `errors`. Ctrl-C, SIGTERM and a closed terminal end in 130.
-    `python -X dev` shows tracebacks.
-    """
-    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
-    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
-        if signal.getsignal(number) == signal.SIG_DFL:  # `nohup` has them ignored
-            signal.signal(number, signal.default_int_handler)
-    try:
-        return main()
-    except KeyboardInterrupt as interrupt:
-        line, code = f"interrupted{f': {interrupt}' if str(interrupt) else ''}", 130
-    except (ValueError, OSError, *errors) as error:
-        if sys.flags.dev_mode:
-            raise
-        line, code = f"error: {' '.join(str(error).split())}", 2
-    except (MemoryError, RuntimeError) as error:
-        if sys.flags.dev_mode or "memory" not in f"{type(error)} {error}".lower():
-            raise
-        line, code = "error: out of memory: use a smaller --preset, batch or --vectorize", 2
-    with suppress(OSError):  # `2>&1 | tee log` may be gone
-        print(line, file=sys.stderr)
-    sys.exit(code)
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
@@ -540,4 +458,8 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main)
+    try:
+        main()
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -17,38 +17,29 @@ N points, A action dim, S state dim.
 """
 
 import argparse
-import fcntl
 import json
 import math
-import os
-import platform
-import shlex
-import signal
-import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from datetime import timedelta
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from clip import text_features
-from data import WindowSampler, command_line, load_demonstrations, write_atomically
+from data import WindowSampler, load_demonstrations, write_atomically
 from model import DAMIPolicy, load_checkpoint
-from simulator import (
-    MetaWorldPointCloudEnv,
-    check_task,
-    collect,
-    evaluation_seed,
+from scripts import (
+    claim_folder,
+    command_line,
+    pick_device,
+    report_facts,
     run_jobs,
-    suite_tasks,
     worker,
+    write_text,
 )
+from simulator import MetaWorldPointCloudEnv, check_task, collect, evaluation_seed, suite_tasks
 
 EPISODES_A_JOB = 10  # side by side in one process; part of the protocol: it shapes the noise drawn
 PAPER_RESULTS = Path(__file__).parent / "assets" / "paper_results.json"
@@ -99,34 +90,6 @@ def mean_interval(values: Sequence[float]) -> str:
 # ---- What to measure, and on what ----------------------------------------------------------------
 
 
-def pick_device(name: str | None) -> torch.device:
-    """`cuda` where there is one unless a name is given; ValueError for a missing device."""
-    name = name or ("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device).item()
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).split("\n")[0]
-        raise ValueError(
-            f"--device {name} cannot be used here ({reason}): use --device cpu"
-        ) from error
-    return device
-
-
-def hardware(device: str | torch.device = "cpu") -> str:
-    """The processor that results are measured on."""
-    if torch.device(device).type == "cuda":
-        return torch.cuda.get_device_name(device)
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        name = next(
-            line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")
-        )
-    except (OSError, StopIteration):
-        name = platform.processor() or platform.machine()
-    return f"{name}, {os.cpu_count()} cores"
-
-
 def checkpoints_of(path: str | Path) -> list[Path]:
     """A file as it is; of a run's folder all its EMA checkpoints, the last one last."""
     path = Path(path)
@@ -156,42 +119,6 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
         )
     print(f"no finished run in {runs}/: using the policy that comes with the code", flush=True)
     return SHIPPED_CHECKPOINT
-
-
-RESULT_FILES = "adapted.pt", "config.json", "metrics.jsonl"
-RESULT_FILES += "success.json", "success.md", "success.png"
-
-
-def claim_folder(folder: Path, kept: str, overwrite: bool) -> None:
-    """Makes a folder for results; ValueError if `kept` is in it and may not be overwritten.
-
-    With `overwrite` old results go, so that none of them stands beside new ones.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    if (folder / kept).exists() and not overwrite:
-        raise ValueError(f"{folder} already holds {kept}: add --overwrite, or choose another --out")
-    for name in RESULT_FILES:
-        (folder / name).unlink(missing_ok=True)
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Makes a folder that no other process may run in, and clears what killed ones left half done.
-
-    The operating system frees it when this process ends, however that comes about.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(f"another process runs in {folder}: use another --out") from None
-        for temporary in folder.glob(".[0-9]*"):  # of `write_atomically` and `save_checkpoint`
-            temporary.unlink()
-        yield
-    finally:
-        os.close(descriptor)
 
 
 # ---- Rollouts ------------------------------------------------------------------------------------
@@ -373,15 +300,6 @@ def evaluate(
 # ---- Reports -------------------------------------------------------------------------------------
 
 
-def report_facts(
-    script: str, argv: Sequence[str] | None, device: str | torch.device
-) -> dict[str, str]:
-    """What stands beside every number: the hardware, the date, and the command that made it."""
-    command = shlex.join(["python", script, *(sys.argv[1:] if argv is None else argv)])
-    date = time.strftime("%Y-%m-%d")
-    return {"hardware": hardware(device), "date": date, "command": command}
-
-
 def paper_success(suite: str | None, task: str) -> float | None:
     """The paper's success rate of DAMI on a task in percent, if it reports one."""
     tables = json.loads(PAPER_RESULTS.read_text())
@@ -463,11 +381,6 @@ def write_report(
     return table
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file, atomically."""
-    write_atomically(path, lambda temporary: temporary.write_text(text))
-
-
 def draw_curves(folder: Path) -> None:
     """Draws curves.png of a run: the query loss, its running mean, and success where measured."""
     from matplotlib.figure import Figure
@@ -496,78 +409,6 @@ def draw_curves(folder: Path) -> None:
 
     path = folder / "curves.png"
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
-
-
-# ---- Runs ----------------------------------------------------------------------------------------
-
-
-def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int, int]:
-    """Joins the processes of torchrun, which share the tasks; returns (device, rank, how many).
-
-    One of them, the leader, collects, logs, saves and evaluates, while the others wait for it.
-    """
-    world, rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
-    if world > tasks:
-        raise ValueError(f"{world} processes for {tasks} tasks: use at most one a task")
-    if world > 1:
-        if device.type == "cuda" and device.index is None:
-            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-        backend = "nccl" if device.type == "cuda" else "gloo"
-        dist.init_process_group(backend, timeout=timedelta(hours=6))  # an evaluation is long
-    return device, rank, world
-
-
-class StopRequest:
-    """Turns Ctrl-C, SIGTERM and a closed terminal into a request to stop after the step at hand.
-
-    A second one stops at once, as does the first while `at_once` is set.
-    """
-
-    def __enter__(self) -> "StopRequest":
-        self.requested = self.at_once = False
-        self.previous = {}
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) != signal.SIG_IGN:  # `nohup` has it ignored
-                self.previous[number] = signal.signal(number, self.handle)
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        for number, handler in self.previous.items():
-            signal.signal(number, handler)
-
-    def handle(self, *_: Any) -> None:
-        if self.requested or self.at_once:
-            raise KeyboardInterrupt
-        self.requested = True
-
-
-def log(folder: Path, **values: Any) -> None:
-    """Appends a line to metrics.jsonl."""
-    with (folder / "metrics.jsonl").open("a") as file:
-        file.write(json.dumps(values) + "\n")
-
-
-def rewind_metrics(folder: Path, step: int) -> None:
-    """Drops the lines that a killed run wrote after its last save; all of them for step 0."""
-    path = folder / "metrics.jsonl"
-    lines = path.read_text().splitlines() if path.exists() else []
-    kept = [line for line in lines if is_whole(line) and json.loads(line)["step"] <= step]
-    write_text(path, "".join(f"{line}\n" for line in kept))
-
-
-def is_whole(line: str) -> bool:
-    """Whether a line of metrics.jsonl was written to its end."""
-    try:
-        return isinstance(json.loads(line)["step"], int)
-    except (ValueError, TypeError, KeyError):
-        return False
-
-
-def logged_successes(folder: Path, step: int) -> Successes | None:
-    """What was measured after a step, if it was."""
-    lines = (folder / "metrics.jsonl").read_text().splitlines()
-    found = [values for values in map(json.loads, lines) if values["step"] == step]
-    return next((values["successes"] for values in found if "successes" in values), None)
 
 
 # ---- Animations ----------------------------------------------------------------------------------

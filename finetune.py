@@ -24,10 +24,12 @@ import torch
 from torch import Tensor
 
 import evaluate
+import scripts
 from clip import text_features
-from data import Flags, WindowSampler, command_line, load_demonstrations, setting
+from data import WindowSampler, load_demonstrations
 from model import DAMIPolicy, ema_model, load_checkpoint, save_checkpoint
-from simulator import INSTRUCTIONS, check_task, collect, progress_bar, suite_tasks
+from scripts import Flags, command_line, progress_bar, setting
+from simulator import INSTRUCTIONS, check_task, collect, suite_tasks
 
 LEARNING_RATES = {"vision": 1e-5, "diffusion": 3e-5, "other": 1e-4}  # AdamW's, by part
 PAPER_LEARNING_RATE = 1e-4  # of the meta-training that they belong to
@@ -150,11 +152,11 @@ def adapt_checkpoint(
     kept = {name: info[name] for name in evaluate.TRAINED}
     about = {"adapted_to": demonstrations.task, "instruction": demonstrations.instruction}
     save_checkpoint(folder / "adapted.pt", adapted, **kept, **about, adaptation=used)
-    evaluate.rewind_metrics(folder, 0)
+    scripts.rewind_metrics(folder, 0)
     for step, loss in enumerate(losses, start=1):
-        evaluate.log(folder, step=step, loss=loss)
+        scripts.log(folder, step=step, loss=loss)
     written = {"checkpoint": str(checkpoint), "data": str(data), **used, "seconds": seconds}
-    evaluate.write_text(folder / "config.json", json.dumps(written, indent=1))
+    scripts.write_text(folder / "config.json", json.dumps(written, indent=1))
     return written
 
 
@@ -180,7 +182,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
     settings = Settings().given(args)
-    device = evaluate.pick_device(args.device)
+    device = scripts.pick_device(args.device)
 
     # Which tasks, from which policy: a recording of one's own, one task, or all novel tasks
     file = Path(args.data) if args.data.endswith(".npz") else None
@@ -196,14 +198,14 @@ def main(argv: list[str] | None = None) -> None:
     start = args.checkpoint or evaluate.default_checkpoint(args.suite if simulated else "own")
     checkpoint = evaluate.checkpoints_of(start)[-1]
     _, info = load_checkpoint(checkpoint, needs=evaluate.TRAINED)
-    where = f"{device} ({evaluate.hardware(device)})"
+    where = f"{device} ({scripts.hardware(device)})"
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {where}", flush=True)
 
     # Folders, demonstrations and instructions
     folder = Path(args.out or f"runs/finetune/{args.task or tasks[0]}-seed{settings.seed}")
     folders = {task: folder / task if args.task == "novel" else folder for task in tasks}
     for path in folders.values():
-        evaluate.claim_folder(path, "adapted.pt", args.overwrite)
+        scripts.claim_folder(path, "adapted.pt", args.overwrite)
     if file is None:
         settings = replace(settings, demonstrations=settings.demonstrations or 10)
         paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
@@ -232,7 +234,7 @@ def main(argv: list[str] | None = None) -> None:
     facts |= {"checkpoint": str(checkpoint), "seconds a task": round(seconds / len(tasks), 1)}
     facts |= {name: getattr(settings, name) for name in ("steps", "demonstrations", "episodes")}
     facts |= {"seed": settings.seed, "text weights": identity}
-    facts |= evaluate.report_facts("finetune.py", argv, device)
+    facts |= scripts.report_facts("finetune.py", argv, device)
     print(f"\n{evaluate.write_report(folder, columns, facts, info['suite'])}")
 
 

@@ -50,12 +50,12 @@ from clip import text_features
 from data import (
     Demonstrations,
     WindowSampler,
-    command_line,
     farthest_point_sample,
     load_demonstrations,
     save_demonstrations,
 )
 from model import load_checkpoint
+from scripts import command_line
 
 STATE_DIM = ACTION_DIM = 7
 

@@ -8,44 +8,28 @@ world frame, metres. The camera casts rays (`mujoco.mj_multiRay`) instead of ras
 here needs OpenGL or a GPU; it works on any MuJoCo model.
 
 Demonstrations come from Meta-World's scripted experts, who act in `record_episode`. They go into
-the files of data.py, the only file of the project that is imported here.
+the files of data.py.
 
 Letters: R rays, M points that the camera sees, N points of an observation.
 """
 
 import argparse
-import multiprocessing
 import os
-import queue
-import signal
-import sys
-import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import gymnasium
 import mujoco
 import numpy as np
 from metaworld import env_dict
 from metaworld.policies import ENV_POLICY_MAP
-from tqdm import tqdm
 
-from data import (
-    Demonstrations,
-    choose,
-    command_line,
-    farthest_point_sample,
-    load_demonstrations,
-    save_demonstrations,
-)
+from data import Demonstrations, farthest_point_sample, load_demonstrations, save_demonstrations
+from scripts import choose, command_line, run_jobs, worker
 
 # Some experts ask for more than 1; their actions are clipped below.
 warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
@@ -471,147 +455,6 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
 if "DAMI/MetaWorld-v0" not in gymnasium.registry:
     gymnasium.register("DAMI/MetaWorld-v0", entry_point=f"{__name__}:MetaWorldPointCloudEnv")
-
-
-# ---- Worker processes, for collecting and for evaluating -----------------------------------------
-
-GRACE = 0.5  # seconds that workers have to end by themselves
-
-# What a job sees of the process that started it; `run_jobs` replaces both in a worker process.
-worker = SimpleNamespace(
-    stop=threading.Event(),  # set when the starting process was interrupted: the job should return
-    finished=queue.SimpleQueue(),  # put (text, number of episodes) here to move the progress bar
-)
-
-
-class StandardError:
-    """stderr, as a progress bar needs it, that a closed pipe (`2>&1 | tee log`) does not break."""
-
-    def write(self, text: str) -> None:
-        with suppress(OSError, ValueError):
-            sys.stderr.write(text)
-
-    def flush(self) -> None:
-        with suppress(OSError, ValueError):
-            sys.stderr.flush()
-
-    def fileno(self) -> int:  # tqdm asks for the width of the terminal
-        return sys.stderr.fileno()
-
-
-def progress_bar(**options: Any) -> tqdm:
-    """A progress bar that no closed terminal or pipe ends the work with."""
-    return tqdm(file=StandardError(), dynamic_ncols=True, **options)
-
-
-def run_jobs(
-    job: Callable[..., Any],
-    jobs: Sequence[tuple],
-    workers: int | None,
-    total: int,
-    label: str,
-    setup: tuple | None = None,
-) -> list:
-    """Calls `job(*arguments)` for each tuple of arguments, in several processes.
-
-    Args:
-        job: a function of a module; it may use `worker.stop` and `worker.finished`.
-        jobs: the arguments of each call.
-        workers: processes; None: one a core.
-        total, label: how many episodes the progress bar counts to, and what it is called.
-        setup: (function, *arguments), called once in each process before its first job.
-
-    Returns:
-        What the calls returned, in the order of `jobs`.
-
-    Raises:
-        ValueError: `workers` is below 1, or a worker process was killed.
-        Exception: what a job raised. By then the other jobs were stopped and no process is left.
-    """
-    if workers is not None and workers < 1:
-        raise ValueError(f"--workers is {workers}: use at least 1")
-    if not jobs:
-        return []
-
-    context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
-    stop, finished = context.Event(), context.SimpleQueue()
-    workers = min(workers or os.cpu_count() or 1, len(jobs))
-    pool = ProcessPoolExecutor(workers, context, start_worker, (stop, finished, setup))
-    try:
-        with ignored_interrupts():  # submitting launches the processes
-            futures = [pool.submit(run_job, job, arguments) for arguments in jobs]
-
-        with progress_bar(total=total, desc=label, unit="episode") as progress:
-            pending = set(futures)
-            while pending:
-                done, pending = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
-                while not finished.empty():
-                    text, episodes = finished.get()
-                    progress.set_postfix_str(text)
-                    progress.update(episodes)
-                for future in done:
-                    future.result()  # raises what the job raised
-
-        return [future.result() for future in futures]
-    except BrokenProcessPool:
-        message = "a worker process was killed, perhaps for memory: try fewer --workers"
-        raise ValueError(message) from None
-    except BaseException:
-        stop.set()
-        raise
-    finally:
-        with ignored_interrupts():
-            timer = threading.Timer(GRACE, kill, [list(pool._processes.values())])
-            timer.start()
-            pool.shutdown(cancel_futures=True)  # waits for the processes
-            timer.cancel()
-
-
-@contextmanager
-def ignored_interrupts() -> Iterator[None]:
-    """Ignores Ctrl-C and a closing terminal inside, also in the processes that are started there.
-
-    A terminal sends both to all of them, yet what to do is up to the starting process alone: it
-    sets `stop`. Processes inherit the ignoring, so it holds from their first instruction on, while
-    they still import. Only the main thread may set handlers, and only it is ever interrupted.
-    """
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if in_main_thread else ()
-    handlers = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-
-
-def kill(processes: Sequence[multiprocessing.Process]) -> None:
-    for process in processes:
-        process.kill()
-
-
-def start_worker(stop: Any, finished: Any, setup: tuple | None) -> None:
-    """Prepares a worker process."""
-    import torch
-
-    torch.set_num_threads(1)  # the other cores have processes of their own
-    worker.stop, worker.finished, worker.setup = stop, finished, setup
-    threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-def end_with_parent() -> None:
-    """Ends this process as soon as the one that started it is gone, killed perhaps."""
-    multiprocessing.parent_process().join()
-    os._exit(1)
-
-
-def run_job(job: Callable[..., Any], arguments: tuple) -> Any:
-    # Not in `start_worker`: an exception there would break the pool and print a traceback.
-    if worker.setup is not None:
-        function, *rest = worker.setup
-        function(*rest)
-        worker.setup = None
-    return job(*arguments)
 
 
 # ---- Collecting demonstrations of the scripted experts -------------------------------------------

@@ -35,19 +35,13 @@ from torch.func import functional_call
 from torch.optim.swa_utils import AveragedModel
 
 import evaluate
+import scripts
 from clip import text_features
-from data import (
-    Demonstrations,
-    Flags,
-    WindowSampler,
-    choose,
-    command_line,
-    load_demonstrations,
-    setting,
-)
+from data import Demonstrations, WindowSampler, load_demonstrations
 from maml import meta_gradient
 from model import PRESETS, DAMIPolicy, PolicyConfig, ema_model, load_checkpoint, save_checkpoint
-from simulator import INSTRUCTIONS, SUITES, collect, progress_bar, suite_tasks
+from scripts import Flags, choose, command_line, progress_bar, setting
+from simulator import INSTRUCTIONS, SUITES, collect, suite_tasks
 
 # ---- Settings ------------------------------------------------------------------------------------
 
@@ -363,7 +357,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    device = evaluate.pick_device(args.device)
+    device = scripts.pick_device(args.device)
     own = own_recordings(args.data) if args.data and not args.suite else {}  # task -> file
     default = "paper" if device.type == "cuda" else "small"
     preset = choose(args.preset or default, PRESETS, "preset")
@@ -375,10 +369,10 @@ def main(argv: list[str] | None = None) -> None:
     paths = own or {task: Path(args.data or "data") / f"{task}.npz" for task in tasks}
     folder = Path(args.out or f"runs/{suite}-{preset}-seed{settings.seed}")
 
-    device, rank, world = evaluate.join_processes(device, len(tasks))
-    with evaluate.locked(folder) if rank == 0 else nullcontext():
+    device, rank, world = scripts.join_processes(device, len(tasks))
+    with scripts.locked(folder) if rank == 0 else nullcontext():
         if rank == 0:
-            where = f"{device} ({evaluate.hardware(device)})"
+            where = f"{device} ({scripts.hardware(device)})"
             print(f"preset {preset} on {where}, {len(tasks)} tasks, in {folder}", flush=True)
             if args.resume and not (folder / "last.pt").exists():
                 raise ValueError(f"there is no run to resume in {folder}: look at --out")
@@ -388,7 +382,7 @@ def main(argv: list[str] | None = None) -> None:
                 collect(tasks, args.data or "data", settings.demonstrations, workers=args.workers)
         if world > 1:
             dist.barrier()
-        facts = evaluate.report_facts("train.py", argv, device)
+        facts = scripts.report_facts("train.py", argv, device)
         run(args, settings, paths, folder, facts, device, rank, world)
         if world > 1:
             dist.destroy_process_group()
@@ -433,9 +427,9 @@ def run(
     facts = {"text_weights": identity, **facts}
     if leader and start == 0:
         written = {"arguments": asdict(settings), "config": asdict(config), **facts}
-        evaluate.write_text(folder / "config.json", json.dumps(written, indent=1))
+        scripts.write_text(folder / "config.json", json.dumps(written, indent=1))
     if leader:
-        evaluate.rewind_metrics(folder, start)
+        scripts.rewind_metrics(folder, start)
 
     def save_last() -> None:
         training = {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
@@ -448,19 +442,19 @@ def run(
         due = step == settings.steps or (step and step % settings.evaluate_every == 0)
         if not leader or not settings.episodes or not due:
             return None
-        if (successes := evaluate.logged_successes(folder, step)) is None:
+        if (successes := scripts.logged_successes(folder, step)) is None:
             stop.at_once = True  # everything is saved
             protocol = (settings.episodes, EVALUATION_SEED, args.workers, device)
             checkpoint, n = folder / f"ema-{step:05d}.pt", settings.demonstrations
             successes = evaluate.evaluate(checkpoint, paths, text, *protocol, n)
             stop.at_once = False
             mean = evaluate.mean_success(successes)
-            evaluate.log(folder, step=step, success=mean, successes=successes)
+            scripts.log(folder, step=step, success=mean, successes=successes)
         return successes
 
     bar = {"desc": "training", "unit": "step", "disable": not leader}
     bar |= {"total": settings.steps, "initial": start}
-    with evaluate.StopRequest() as stop, progress_bar(**bar) as progress:
+    with scripts.StopRequest() as stop, progress_bar(**bar) as progress:
         measure(start)  # the run may have been stopped while it was measured
         began = saved = time.monotonic()
         for step, figures in meta_train(
@@ -471,7 +465,7 @@ def run(
                 progress.update()
                 progress.set_postfix(loss=f"{figures['loss']:.4f}")
                 figures["lr"] = optimizer.param_groups[0]["lr"]
-                evaluate.log(folder, step=step, **figures, seconds=round(seconds, 2))
+                scripts.log(folder, step=step, **figures, seconds=round(seconds, 2))
 
                 milestone = step == settings.steps or step % settings.checkpoint_every == 0
                 if milestone:

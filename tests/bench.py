@@ -19,10 +19,11 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from clip import text_features
 from data import Demonstrations, WindowSampler, farthest_point_sample, load_demonstrations
-from evaluate import EPISODES_A_JOB, SHIPPED_CHECKPOINT, hardware, pick_device, rollout
+from evaluate import EPISODES_A_JOB, SHIPPED_CHECKPOINT, rollout
 from finetune import BATCH, adapt_policy
 from maml import adapt, meta_gradient
 from model import PRESETS, DAMIPolicy, PolicyConfig, load_checkpoint
+from scripts import hardware, pick_device
 from simulator import (
     MetaWorldPointCloudEnv,
     collect,

@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import signal
+from contextlib import contextmanager
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before torch; on small matrices threads wait
 
@@ -12,9 +13,9 @@ import pytest
 import torch
 
 import clip
-import data
 import evaluate
 import model
+import scripts
 import simulator
 import train
 
@@ -34,13 +35,22 @@ def recorded(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="session")
-def small_suite():
+@contextmanager
+def three_tasks():
     """ML10 with three of its ten base tasks; the text tower is built once, not at every call."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(simulator.SUITES, "ml10", SMALL_ML10)
-        cached = functools.cache(clip.load_clip_text_encoder)
-        patch.setattr(clip, "load_clip_text_encoder", cached)
+        patch.setattr(clip, "load_clip_text_encoder", load_once)
+        yield patch
+
+
+load_once = functools.cache(clip.load_clip_text_encoder)
+
+
+@pytest.fixture
+def small_suite():
+    """`three_tasks` for one test."""
+    with three_tasks():
         yield
 
 
@@ -57,10 +67,10 @@ def own_folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def run(recorded, small_suite, tmp_path_factory):
+def run(recorded, tmp_path_factory):
     """The folder of a run of train.py with evaluation, to be left as it is."""
     folder = tmp_path_factory.mktemp("trained")
-    with pytest.MonkeyPatch.context() as patch:
+    with three_tasks() as patch:
         patch.chdir(folder)
         patch.setattr(evaluate, "EPISODES_A_JOB", 1)  # jobs enough for both workers
         options = "--episodes 2 --evaluate-every 6 --workers 2".split()
@@ -73,7 +83,7 @@ def fails(script, argv, capsys):
     capsys.readouterr()
     errors = [script.RobotError] if hasattr(script, "RobotError") else []
     with pytest.raises(SystemExit) as end:
-        data.command_line(lambda: script.main([str(arg) for arg in argv]), *errors)
+        scripts.command_line(lambda: script.main([str(arg) for arg in argv]), *errors)
     error = capsys.readouterr().err.split("\r")[-1]  # after a progress bar
     line = error.strip("\n").split("\n")[-1]
     assert end.value.code == 2 and line.startswith("error: ") and "Traceback" not in error, error

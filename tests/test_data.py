@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import data
+import scripts
 from data import Demonstrations, WindowSampler
 from model import PolicyConfig
 
@@ -273,8 +274,35 @@ def test_a_demonstration_is_one_whole_episode_at_the_stride():
         "demo_action": (1, 4, 4),
     }
     assert all(x.dtype == torch.float32 for x in demo.values())
-    drawn = [sampler.demonstration(seeded(seed))["demo_state"].shape[1] for seed in range(20)]
-    assert set(drawn) == {5, 4}
+    assert {sampler.draw_episode(seeded(seed)) for seed in range(20)} == {0, 1}
+
+
+def test_no_window_is_from_the_reference_demonstration_unless_it_is_the_only_one():
+    recorded = recording((40, 40, 40))
+    recorded.state[:] = np.repeat([0, 1, 2], 40)[:, None]
+    sampler = WindowSampler(recorded, SIZES)
+    for seed in range(10):
+        batch = sampler.batch(30, seeded(seed))
+        assert not (batch["state"] == batch["demo_state"][0, 0]).any()
+        assert len(batch["state"].unique()) == 2
+    alone = WindowSampler(recorded.take(1), SIZES).batch(8, seeded())
+    assert (alone["state"] == alone["demo_state"][0, 0]).all()
+
+
+def test_a_mirrored_batch_moves_left_where_the_other_moves_right(monkeypatch):
+    for bound in ("TURN", "STRETCH"):
+        monkeypatch.setattr(data, bound, 0)
+    monkeypatch.setattr(data, "SHIFT", (0, 0, 0))
+    meta = {"positions_in_state": 3}
+    sampler = WindowSampler(replace(recording((40, 40)), meta=meta), SIZES, augment=True)
+    plain, mirrored = (sampler.batch(8, seeded(), mirror=mirror) for mirror in (False, True))
+    flip, x = torch.tensor([-1.0, 1, 1]), torch.tensor([1.0, 0, 0])
+    for part in ("points", "demo_points"):
+        expected = plain[part] * flip + 2 * x * sampler.middle
+        torch.testing.assert_close(mirrored[part], expected, atol=1e-5, rtol=0)
+    for part in ("action", "demo_action"):
+        torch.testing.assert_close(mirrored[part][..., :3], plain[part][..., :3] * flip)
+        assert torch.equal(mirrored[part][..., 3], plain[part][..., 3])
 
 
 @pytest.mark.parametrize(
@@ -362,11 +390,11 @@ def test_scenes_turn_about_the_middle_of_the_workspace_or_else_of_the_points():
 
 
 @dataclass(frozen=True)
-class Settings(data.Flags):
-    learning_rate: float = data.setting(0.1, "how fast", least=0.0)
-    steps: int | None = data.setting(None, "how many", least=1, most=9)
-    order: str = data.setting("up", "which way", choices=["up", "down"])
-    loud: bool = data.setting(True, "whether to shout")
+class Settings(scripts.Flags):
+    learning_rate: float = scripts.setting(0.1, "how fast", least=0.0)
+    steps: int | None = scripts.setting(None, "how many", least=1, most=9)
+    order: str = scripts.setting("up", "which way", choices=["up", "down"])
+    loud: bool = scripts.setting(True, "whether to shout")
 
 
 def test_flags_follow_the_fields_of_a_dataclass():
@@ -410,21 +438,21 @@ def say(error):
     "call, message",
     [
         (lambda: data.main(["--show", "nothing.npz"]), "nothing.npz is missing"),
-        (lambda: data.choose("shelf-plce", ["shelf-place", "push"], "task"), "'shelf-place'?"),
-        (lambda: data.choose("x", ["push", "pull"], "task"), "choose one of: pull, push"),
+        (lambda: scripts.choose("shelf-plce", ["shelf-place", "push"], "task"), "'shelf-place'?"),
+        (lambda: scripts.choose("x", ["push", "pull"], "task"), "choose one of: pull, push"),
         (lambda: say(PermissionError("no access")), "no access"),
     ],
 )
 def test_what_the_user_gets_wrong_ends_in_one_line_and_exit_code_2(call, message, capsys):
     with pytest.raises(SystemExit) as end:
-        data.command_line(call)
+        scripts.command_line(call)
     error = capsys.readouterr().err
     assert end.value.code == 2 and message in error and error.count("\n") == 1
 
 
 def test_interrupting_ends_with_exit_code_130(capsys):
     with pytest.raises(SystemExit) as end:
-        data.command_line(lambda: say(KeyboardInterrupt()))
+        scripts.command_line(lambda: say(KeyboardInterrupt()))
     assert end.value.code == 130 and "interrupted" in capsys.readouterr().err
 
 

@@ -9,10 +9,10 @@ import torch
 from conftest import BASE, fails
 
 import clip
-import data
 import evaluate
 import finetune
 import model
+import scripts
 import simulator
 import train
 
@@ -215,5 +215,5 @@ def test_a_policy_of_own_recordings_cannot_be_rolled_out(run, recorded, capsys):
 
 def test_a_command_ends_quietly_or_in_one_line(capsys):
     with pytest.raises(SystemExit) as end:
-        data.command_line(lambda: (_ for _ in ()).throw(KeyboardInterrupt()))
+        scripts.command_line(lambda: (_ for _ in ()).throw(KeyboardInterrupt()))
     assert end.value.code == 130

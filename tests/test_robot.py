@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation, Slerp
 import data
 import model
 import robot
+import scripts
 from robot import RTDE, Gripper, RobotError, Servo, Settings
 from tests.emulator import START_POSE, Emulator, write_scene
 
@@ -380,7 +381,7 @@ def test_a_robot_in_trouble_is_not_moved_at_all(emulator, settings):
     assert robot.servo_turn(settings) in program and 'rtde_set_watchdog("input_int' in program
     emulator.faults.no_program = False
     emulator.pose[0] = 0.25
-    with pytest.raises(RobotError, match="outside its box, at 0.250, -0.550"):
+    with pytest.raises(RobotError, match=r"outside its box, at 0\.250, -0\.550"):
         Moving(settings).__enter__()
     emulator.pose[0] = float("nan")
     with pytest.raises(RobotError, match="not finite"):
@@ -708,7 +709,7 @@ def is_held(emulator):
 def ends(argv):
     """The exit code of a command."""
     try:
-        data.command_line(lambda: robot.main(argv), robot.RobotError)
+        scripts.command_line(lambda: robot.main(argv), robot.RobotError)
     except SystemExit as end:
         return end.code
     return 0

@@ -21,8 +21,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import simulator
-from data import command_line, load_demonstrations, save_demonstrations
-from simulator import MetaWorldPointCloudEnv, RayCastCamera, collect, run_jobs
+from data import load_demonstrations, save_demonstrations
+from scripts import command_line, run_jobs
+from simulator import MetaWorldPointCloudEnv, RayCastCamera, collect
 
 ROOT = Path(simulator.__file__).resolve().parent
 
@@ -315,11 +316,11 @@ def test_a_fault_in_one_process_ends_all(job, jobs, setup, error, message, capfd
 
 SLEEPERS = """
 import os, signal, sys, threading, time
-import simulator
+import scripts
 kill, target = {"SIGINT": (os.killpg, 0), "SIGKILL": (os.kill, os.getpid())}[sys.argv[1]]
 threading.Timer(0.3, kill, (target, signal.Signals[sys.argv[1]])).start()
 sleepers = [(60,), (60,)]
-simulator.command_line(lambda: simulator.run_jobs(time.sleep, sleepers, 2, 2, "sleeping"))
+scripts.command_line(lambda: scripts.run_jobs(time.sleep, sleepers, 2, 2, "sleeping"))
 """
 
 

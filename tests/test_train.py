@@ -30,7 +30,7 @@ import data
 import evaluate
 import finetune
 import model
-import simulator
+import scripts
 import train
 
 ROOT = Path(train.__file__).resolve().parent
@@ -134,14 +134,14 @@ def killed_run(recorded, out, step):
     """Trains in a process killed (SIGKILL) just after logging `step`, between two savings."""
     program = f"""
 import os, signal
-import evaluate, simulator, train
+import scripts, simulator, train
 simulator.SUITES["ml10"] = {SMALL_ML10!r}
-log = evaluate.log
+log = scripts.log
 def log_and_die(folder, **values):
     log(folder, **values)
     if values["step"] == {step}:
         os.kill(os.getpid(), signal.SIGKILL)
-evaluate.log = log_and_die
+scripts.log = log_and_die
 train.main({["--data", str(recorded), "--out", str(out), *FEW]!r})
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True)
@@ -165,21 +165,21 @@ def test_a_run_killed_between_savings_resumes_to_the_same_bits(run, recorded, tm
 def test_ctrl_c_saves_says_how_to_resume_and_ends_with_130(
     run, recorded, tmp_path, monkeypatch, capsys, number
 ):
-    log, out = evaluate.log, tmp_path / "interrupted"
+    log, out = scripts.log, tmp_path / "interrupted"
 
     def log_and_interrupt(folder, **values):
         log(folder, **values)
         if values["step"] == 2:
             signal.raise_signal(number)
 
-    monkeypatch.setattr(evaluate, "log", log_and_interrupt)
+    monkeypatch.setattr(scripts, "log", log_and_interrupt)
     argv = ["--data", str(recorded), "--out", str(out), *FEW]
     with pytest.raises(SystemExit) as end:
-        data.command_line(lambda: train.main(argv))
+        scripts.command_line(lambda: train.main(argv))
     error = capsys.readouterr().err
     assert end.value.code == 130 and "saved after step 2" in error and "--resume" in error
     assert weights(out / "last.pt")[1]["step"] == 2
-    monkeypatch.setattr(evaluate, "log", log)
+    monkeypatch.setattr(scripts, "log", log)
     train.main([*argv, "--resume"])
     assert same_bits(whole_state(out), whole_state(run))
 
@@ -195,7 +195,7 @@ def test_a_run_stopped_while_it_is_measured_is_measured_when_resumed(
     with monkeypatch.context() as patch:
         patch.setattr(evaluate, "evaluate", stopped)
         with pytest.raises(SystemExit) as end:
-            data.command_line(lambda: train.main(argv))
+            scripts.command_line(lambda: train.main(argv))
     assert end.value.code == 130 and weights(tmp_path / "run" / "last.pt")[1]["step"] == 6
     assert not (tmp_path / "run" / "success.json").exists()
     (tmp_path / "run" / ".123.last.pt").write_text("left by a killed process")
@@ -217,11 +217,11 @@ def test_a_broken_pipe_does_not_end_the_work(monkeypatch):
         flush = write
 
     monkeypatch.setattr(sys, "stderr", Broken())
-    with simulator.progress_bar(total=2) as progress:
+    with scripts.progress_bar(total=2) as progress:
         progress.update()
         progress.set_postfix(loss="0")
     with pytest.raises(SystemExit) as end:
-        data.command_line(lambda: (_ for _ in ()).throw(ValueError("x")))
+        scripts.command_line(lambda: (_ for _ in ()).throw(ValueError("x")))
     assert end.value.code == 2
 
 
@@ -261,9 +261,9 @@ def test_every_way_of_training_learns_something_of_its_own(recorded, tmp_path):
 def test_two_processes_under_torchrun_train_as_one_does(recorded, tmp_path):
     script = tmp_path / "small_train.py"
     script.write_text(
-        "import sys\nimport data, simulator, train\n"
+        "import sys\nimport scripts, simulator, train\n"
         f'simulator.SUITES["ml10"] = {SMALL_ML10!r}\n'  # three tasks: unequal shares
-        "data.command_line(lambda: train.main(sys.argv[1:]))\n"
+        "scripts.command_line(lambda: train.main(sys.argv[1:]))\n"
     )
 
     def torchrun(processes, argv):
@@ -364,7 +364,7 @@ def test_what_cannot_be_resumed_is_said(run, recorded, tmp_path, capsys):
     out.mkdir()
     (out / "ema-00003.pt").write_bytes(b"all that is left")
     assert "already holds a run" in fails(train, [*argv, "--out", out], capsys)
-    with evaluate.locked(tmp_path / "busy"):
+    with scripts.locked(tmp_path / "busy"):
         message = fails(train, [*argv, "--out", tmp_path / "busy"], capsys)
     assert "another process runs in" in message
     assert "no folder" in fails(train, ["--preset", "tiny", "--data", "misspelt"], capsys)

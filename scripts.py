@@ -1,0 +1,403 @@
+"""What every script does the same way; nothing here is part of the method.
+
+Settings become flags, a mistake ends in one line, a folder belongs to one run, Ctrl-C finishes the
+step at hand, work is shared among processes. Skip this file when reading the method.
+"""
+
+import argparse
+import difflib
+import fcntl
+import json
+import math
+import multiprocessing
+import os
+import platform
+import queue
+import shlex
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import field, fields, replace
+from datetime import timedelta
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import torch
+import torch.distributed as dist
+from tqdm import tqdm
+
+from data import write_atomically
+
+# ---- Settings: each said once, as a field --------------------------------------------------------
+
+
+def setting(default: Any, help: str, **bounds: Any) -> Any:
+    """A field of `Flags`: its default, its line of help, and its bounds: least, most, choices."""
+    return field(default=default, metadata={"help": help, **bounds})
+
+
+class Flags:
+    """Base of a frozen dataclass whose fields, made by `setting`, are flags of a script."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            largest = sys.float_info.max if isinstance(value, float) else sys.maxsize
+            least, most = f.metadata.get("least", -math.inf), f.metadata.get("most", largest)
+            if isinstance(value, (int, float)) and not least <= value <= most:
+                limit = f"at most {most}" if value > most else f"at least {least}"
+                raise ValueError(f"--{f.name.replace('_', '-')} is {value}: use {limit}")
+
+    @classmethod
+    def add_flags(cls, parser: Any) -> None:
+        """Adds a flag for each field; one that is not given is None."""
+        for f in fields(cls):
+            kind = next((t for t in get_args(f.type) if t is not type(None)), f.type)
+            if kind is bool:
+                options = {"action": argparse.BooleanOptionalAction}
+            else:
+                options = {"type": kind, "choices": f.metadata.get("choices")}
+            parser.add_argument(f"--{f.name.replace('_', '-')}", help=f.metadata["help"], **options)
+
+    def given(self, args: argparse.Namespace, **more: Any) -> Any:
+        """Returns these settings with what was given on the command line, and `more`."""
+        flags = {f.name: getattr(args, f.name) for f in fields(self)} | more
+        return replace(self, **{name: value for name, value in flags.items() if value is not None})
+
+
+# ---- Command lines -------------------------------------------------------------------------------
+
+
+def choose(name: str, names: Iterable[str], what: str) -> str:
+    """Returns `name` if it is one of `names`; otherwise ValueError with the nearest right one."""
+    names = sorted(names)
+    if name in names:
+        return name
+    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.4)
+    advice = f"did you mean {near[0]!r}?" if near else f"choose one of: {', '.join(names)}"
+    raise ValueError(f"unknown {what} {name!r}: {advice}")
+
+
+def command_line(main: Callable[[], None], *errors: type[Exception]) -> None:
+    """Runs a script's `main`: what a user can cause ends in one line on stderr and exit code 2.
+
+    That is ValueError, OSError and `errors`. Ctrl-C, SIGTERM and a closed terminal end in 130.
+    `python -X dev` shows tracebacks.
+    """
+    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+        if signal.getsignal(number) == signal.SIG_DFL:  # `nohup` has them ignored
+            signal.signal(number, signal.default_int_handler)
+    try:
+        return main()
+    except KeyboardInterrupt as interrupt:
+        line, code = f"interrupted{f': {interrupt}' if str(interrupt) else ''}", 130
+    except (ValueError, OSError, *errors) as error:
+        if sys.flags.dev_mode:
+            raise
+        line, code = f"error: {' '.join(str(error).split())}", 2
+    except (MemoryError, RuntimeError) as error:
+        if sys.flags.dev_mode or "memory" not in f"{type(error)} {error}".lower():
+            raise
+        line, code = "error: out of memory: use a smaller --preset, batch or --vectorize", 2
+    with suppress(OSError):  # `2>&1 | tee log` may be gone
+        print(line, file=sys.stderr)
+    sys.exit(code)
+
+
+def pick_device(name: str | None) -> torch.device:
+    """`cuda` where there is one unless a name is given; ValueError for a missing device."""
+    name = name or ("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).split("\n")[0]
+        raise ValueError(
+            f"--device {name} cannot be used here ({reason}): use --device cpu"
+        ) from error
+    return device
+
+
+def hardware(device: str | torch.device = "cpu") -> str:
+    """The processor that results are measured on."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_name(device)
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(
+            line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")
+        )
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
+    return f"{name}, {os.cpu_count()} cores"
+
+
+def report_facts(
+    script: str, argv: Sequence[str] | None, device: str | torch.device
+) -> dict[str, str]:
+    """What stands beside every number: the hardware, the date, and the command that made it."""
+    command = shlex.join(["python", script, *(sys.argv[1:] if argv is None else argv)])
+    date = time.strftime("%Y-%m-%d")
+    return {"hardware": hardware(device), "date": date, "command": command}
+
+
+# ---- Folders of runs -----------------------------------------------------------------------------
+
+
+RESULT_FILES = "adapted.pt", "config.json", "metrics.jsonl"
+RESULT_FILES += "success.json", "success.md", "success.png"
+
+
+def claim_folder(folder: Path, kept: str, overwrite: bool) -> None:
+    """Makes a folder for results; ValueError if `kept` is in it and may not be overwritten.
+
+    With `overwrite` old results go, so that none of them stands beside new ones.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if (folder / kept).exists() and not overwrite:
+        raise ValueError(f"{folder} already holds {kept}: add --overwrite, or choose another --out")
+    for name in RESULT_FILES:
+        (folder / name).unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Makes a folder that no other process may run in, and clears what killed ones left half done.
+
+    The operating system frees it when this process ends, however that comes about.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"another process runs in {folder}: use another --out") from None
+        for temporary in folder.glob(".[0-9]*"):  # of `write_atomically` and `save_checkpoint`
+            temporary.unlink()
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file, atomically."""
+    write_atomically(path, lambda temporary: temporary.write_text(text))
+
+
+def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int, int]:
+    """Joins the processes of torchrun, which share the tasks; returns (device, rank, how many).
+
+    One of them, the leader, collects, logs, saves and evaluates, while the others wait for it.
+    """
+    world, rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
+    if world > tasks:
+        raise ValueError(f"{world} processes for {tasks} tasks: use at most one a task")
+    if world > 1:
+        if device.type == "cuda" and device.index is None:
+            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        dist.init_process_group(backend, timeout=timedelta(hours=6))  # an evaluation is long
+    return device, rank, world
+
+
+class StopRequest:
+    """Turns Ctrl-C, SIGTERM and a closed terminal into a request to stop after the step at hand.
+
+    A second one stops at once, as does the first while `at_once` is set.
+    """
+
+    def __enter__(self) -> "StopRequest":
+        self.requested = self.at_once = False
+        self.previous = {}
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) != signal.SIG_IGN:  # `nohup` has it ignored
+                self.previous[number] = signal.signal(number, self.handle)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        for number, handler in self.previous.items():
+            signal.signal(number, handler)
+
+    def handle(self, *_: Any) -> None:
+        if self.requested or self.at_once:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+def log(folder: Path, **values: Any) -> None:
+    """Appends a line to metrics.jsonl."""
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps(values) + "\n")
+
+
+def rewind_metrics(folder: Path, step: int) -> None:
+    """Drops the lines that a killed run wrote after its last save; all of them for step 0."""
+    path = folder / "metrics.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    kept = [line for line in lines if is_whole(line) and json.loads(line)["step"] <= step]
+    write_text(path, "".join(f"{line}\n" for line in kept))
+
+
+def is_whole(line: str) -> bool:
+    """Whether a line of metrics.jsonl was written to its end."""
+    try:
+        return isinstance(json.loads(line)["step"], int)
+    except (ValueError, TypeError, KeyError):
+        return False
+
+
+def logged_successes(folder: Path, step: int) -> dict[str, list[bool]] | None:
+    """What was measured after a step, if it was."""
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    found = [values for values in map(json.loads, lines) if values["step"] == step]
+    return next((values["successes"] for values in found if "successes" in values), None)
+
+
+# ---- Worker processes, for collecting and for evaluating -----------------------------------------
+
+GRACE = 0.5  # seconds that workers have to end by themselves
+
+# What a job sees of the process that started it; `run_jobs` replaces both in a worker process.
+worker = SimpleNamespace(
+    stop=threading.Event(),  # set when the starting process was interrupted: the job should return
+    finished=queue.SimpleQueue(),  # put (text, number of episodes) here to move the progress bar
+)
+
+
+class StandardError:
+    """stderr, as a progress bar needs it, that a closed pipe (`2>&1 | tee log`) does not break."""
+
+    def write(self, text: str) -> None:
+        with suppress(OSError, ValueError):
+            sys.stderr.write(text)
+
+    def flush(self) -> None:
+        with suppress(OSError, ValueError):
+            sys.stderr.flush()
+
+    def fileno(self) -> int:  # tqdm asks for the width of the terminal
+        return sys.stderr.fileno()
+
+
+def progress_bar(**options: Any) -> tqdm:
+    """A progress bar that no closed terminal or pipe ends the work with."""
+    return tqdm(file=StandardError(), dynamic_ncols=True, **options)
+
+
+def run_jobs(
+    job: Callable[..., Any],
+    jobs: Sequence[tuple],
+    workers: int | None,
+    total: int,
+    label: str,
+    setup: tuple | None = None,
+) -> list:
+    """Calls `job(*arguments)` for each tuple of arguments, in several processes.
+
+    Args:
+        job: a function of a module; it may use `worker.stop` and `worker.finished`.
+        jobs: the arguments of each call.
+        workers: processes; None: one a core.
+        total, label: how many episodes the progress bar counts to, and what it is called.
+        setup: (function, *arguments), called once in each process before its first job.
+
+    Returns:
+        What the calls returned, in the order of `jobs`.
+
+    Raises:
+        ValueError: `workers` is below 1, or a worker process was killed.
+        Exception: what a job raised. By then the other jobs were stopped and no process is left.
+    """
+    if workers is not None and workers < 1:
+        raise ValueError(f"--workers is {workers}: use at least 1")
+    if not jobs:
+        return []
+
+    context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
+    stop, finished = context.Event(), context.SimpleQueue()
+    workers = min(workers or os.cpu_count() or 1, len(jobs))
+    pool = ProcessPoolExecutor(workers, context, start_worker, (stop, finished, setup))
+    try:
+        with ignored_interrupts():  # submitting launches the processes
+            futures = [pool.submit(run_job, job, arguments) for arguments in jobs]
+
+        with progress_bar(total=total, desc=label, unit="episode") as progress:
+            pending = set(futures)
+            while pending:
+                done, pending = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
+                while not finished.empty():
+                    text, episodes = finished.get()
+                    progress.set_postfix_str(text)
+                    progress.update(episodes)
+                for future in done:
+                    future.result()  # raises what the job raised
+
+        return [future.result() for future in futures]
+    except BrokenProcessPool:
+        message = "a worker process was killed, perhaps for memory: try fewer --workers"
+        raise ValueError(message) from None
+    except BaseException:
+        stop.set()
+        raise
+    finally:
+        with ignored_interrupts():
+            timer = threading.Timer(GRACE, kill, [list(pool._processes.values())])
+            timer.start()
+            pool.shutdown(cancel_futures=True)  # waits for the processes
+            timer.cancel()
+
+
+@contextmanager
+def ignored_interrupts() -> Iterator[None]:
+    """Ignores Ctrl-C and a closing terminal inside, also in the processes that are started there.
+
+    A terminal sends both to all of them, yet what to do is up to the starting process alone: it
+    sets `stop`. Processes inherit the ignoring, so it holds from their first instruction on, while
+    they still import. Only the main thread may set handlers, and only it is ever interrupted.
+    """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if in_main_thread else ()
+    handlers = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def kill(processes: Sequence[multiprocessing.Process]) -> None:
+    for process in processes:
+        process.kill()
+
+
+def start_worker(stop: Any, finished: Any, setup: tuple | None) -> None:
+    """Prepares a worker process."""
+    import torch
+
+    torch.set_num_threads(1)  # the other cores have processes of their own
+    worker.stop, worker.finished, worker.setup = stop, finished, setup
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def end_with_parent() -> None:
+    """Ends this process as soon as the one that started it is gone, killed perhaps."""
+    multiprocessing.parent_process().join()
+    os._exit(1)
+
+
+def run_job(job: Callable[..., Any], arguments: tuple) -> Any:
+    # Not in `start_worker`: an exception there would break the pool and print a traceback.
+    if worker.setup is not None:
+        function, *rest = worker.setup
+        function(*rest)
+        worker.setup = None
+    return job(*arguments)
