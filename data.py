@@ -189,13 +189,11 @@ TURN = math.radians(10)  # about the vertical, at most
 STRETCH = 0.1  # share of shear and stretch, at most
 
 
-def draw_affine_maps(
-    n: int, middle: Tensor, generator: torch.Generator, mirror: bool = False
-) -> tuple[Tensor, Tensor]:
+def draw_affine_maps(n: int, middle: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Draws n affine maps of space, x -> x A^T + b: a shear and stretch, a turn, a shift.
 
-    The turn is about the vertical through `middle` (1, 3), metres; `mirror` reverses x.
-    Returns A (n, 3, 3) and b (n, 1, 3), float32.
+    The turn is about the vertical through `middle` (1, 3), metres. Returns A (n, 3, 3) and
+    b (n, 1, 3), float32.
     """
 
     def symmetric(*shape: int) -> Tensor:
@@ -206,10 +204,42 @@ def draw_affine_maps(
     cos, sin = angle.cos(), angle.sin()
     turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1).view(n, 3, 3)
     a = turn @ (torch.eye(3) + STRETCH * symmetric(n, 3, 3))
-    if mirror:
-        a = a * torch.tensor([-1.0, 1.0, 1.0])
     b = middle - middle @ a.mT + torch.tensor(SHIFT) * symmetric(n, 3)[:, None]
     return a, b
+
+
+def backwards(recorded: Demonstrations, rest: int = 20) -> Demonstrations | None:
+    """Plays every episode from `rest` frames after its success back to its first frame.
+
+    That is another task in the same scenes, and as far as nothing falls a possible one: a drawer
+    closes where it opened. An action leads to the frame that is played next: its displacement is
+    the hand's, in units of an action (as the fastest frames are to the largest actions), its
+    gripper what was asked for there. What is left of an episode rests in its last frame. Returns
+    None for a recording that does not tell its successes and where the hand is in its state.
+    """
+    if not all(recorded.meta.get(key) for key in ("success_frames", "positions_in_state")):
+        return None
+    ends, frames, lengths = recorded.episode_ends, [], []
+    for index, success in zip(range(len(recorded)), recorded.meta["success_frames"]):
+        whole = recorded.episode(index)
+        played = np.arange(min(whole.start + success + rest, whole.stop - 1), whole.start - 1, -1)
+        frames.append(np.pad(played, (0, whole.stop - whole.start - len(played)), mode="edge"))
+        lengths.append(len(played))
+    frame = np.concatenate(frames)  # (F,)
+    following = np.roll(frame, -1)
+    following[ends - 1] = frame[ends - 1]
+
+    hand, actions = recorded.state[:, :3], recorded.action
+    moved = hand[following] - hand[frame]  # (F, 3)
+    fast, full = (np.quantile(np.abs(x).max(axis=1), 0.95) for x in (moved, actions[:, :3]))
+    displacement = (moved * (full / max(fast, 1e-6))).clip(-1, 1).astype(np.float32)
+    return replace(
+        recorded,
+        points=recorded.points[frame],
+        state=recorded.state[frame],
+        action=np.concatenate([displacement, actions[following, 3:]], axis=1),
+        meta=recorded.meta | {"success_frames": [max(n - 1 - rest, 0) for n in lengths]},
+    )
 
 
 # ---- Windows -------------------------------------------------------------------------------------
@@ -254,12 +284,9 @@ class WindowSampler:
         self.action = torch.tensor(demonstrations.action, dtype=torch.float32, device=device)
 
         meta = demonstrations.meta
-        self.known_positions = meta.get("positions_in_state", 0)
-        self.positions = self.known_positions if augment else 0
+        self.positions = meta.get("positions_in_state", 0) if augment else 0
         box = meta.get("workspace") or [points.min((0, 1)).tolist(), points.max((0, 1)).tolist()]
-        self.middle = torch.tensor(box, dtype=torch.float32).mean(
-            dim=0, keepdim=True
-        )  # (1, 3) turned about
+        self.middle = torch.tensor(box).float().mean(dim=0, keepdim=True)  # (1, 3) turned about
 
         successes = meta.get("success_frames", []) if after_success is not None else []
         windows, counts = [], []
@@ -273,7 +300,6 @@ class WindowSampler:
             counts.append(len(frames))
         self.windows = torch.cat(windows).to(device)  # (W, H) the frame of each action
         self.episode_of = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))  # (W,)
-        self.undoing = self.undo_actions() if self.known_positions else None
 
     def check_fit(self, demonstrations: Demonstrations) -> None:
         """Raises ValueError where recording and policy disagree."""
@@ -292,50 +318,31 @@ class WindowSampler:
                 f"the policy {config.demo_positions} positions: cut it, or train on such data"
             )
 
-    def undo_actions(self) -> Tensor:
-        """The action of each frame that leads back to the frame before it, (F, A).
-
-        The displacement is what the first position in the state did, in units of an action, as the
-        fastest frames are to the largest actions; the gripper's is that of the frame before.
-        """
-        hand, before = self.state[:, :3], torch.arange(len(self.state)).roll(1)
-        for episode in self.episodes:
-            before[episode.start] = episode.start  # nothing came before
-        displacement = hand[before] - hand  # (F, 3)
-        forward = self.action[before, :3]
-        fast, full = (x.abs().max(dim=1).values.quantile(0.95) for x in (displacement, forward))
-        undoing = (displacement * full / fast.clamp(min=1e-6)).clamp(-1, 1)
-        return torch.cat([undoing, self.action[before, 3:]], dim=1)
-
     def __len__(self) -> int:
         return len(self.windows)
 
-    def sample(
-        self, n: int, generator: torch.Generator, backwards: bool = False, without: int = -1
-    ) -> dict[str, Tensor]:
+    def sample(self, n: int, generator: torch.Generator, without: int = -1) -> dict[str, Tensor]:
         """Draws n different windows (with repetition only where there are fewer than n).
 
         None is of the episode `without`, unless that is the only one.
         Returns points (n, To, N, 3), state (n, To, S), action (n, H, A), all float32.
         """
         others = (self.episode_of != without).nonzero()[:, 0]
-        others = others if len(others) else torch.arange(len(self))
-        count, device = len(others), generator.device
+        count, device = len(others) or len(self), generator.device
         if n <= count:
             chosen = torch.randperm(count, generator=generator, device=device)[:n]
         else:
             chosen = torch.randint(count, (n,), generator=generator, device=device)
-        return self.gather(others[chosen.cpu()], backwards)
+        return self.gather(others[chosen.cpu()] if len(others) else chosen)
 
-    def gather(self, indices: Tensor, backwards: bool = False) -> dict[str, Tensor]:
+    def gather(self, indices: Tensor) -> dict[str, Tensor]:
         """Returns the windows of these indices (n,), as `sample` does."""
         frames = self.windows[indices.to(self.windows.device)]  # (n, H)
-        frames = frames.flip(1) if backwards else frames
         observed = frames[:, : self.config.n_obs_steps]  # (n, To)
         return {
             "points": self.points[observed].float(),  # (n, To, N, 3)
             "state": self.state[observed],  # (n, To, S)
-            "action": (self.undoing if backwards else self.action)[frames],  # (n, H, A)
+            "action": self.action[frames],  # (n, H, A)
         }
 
     def draw_episode(self, generator: torch.Generator) -> int:
@@ -343,44 +350,35 @@ class WindowSampler:
         n, device = len(self.episodes), generator.device
         return int(torch.randint(n, (1,), generator=generator, device=device))
 
-    def demonstration(self, episode: int, backwards: bool = False) -> dict[str, Tensor]:
+    def demonstration(self, episode: int) -> dict[str, Tensor]:
         """Returns a complete episode, every demo_stride-th frame of it.
 
         Returns demo_points (1, T, N, 3), demo_state (1, T, S), demo_action (1, T, A), all float32:
         what `DAMIPolicy.encode_demo` takes.
         """
         whole = self.episodes[episode]
-        frames = torch.arange(whole.start, whole.stop, self.config.demo_stride)
-        frames = frames.flip(0) if backwards else frames
+        frames = slice(whole.start, whole.stop, self.config.demo_stride)
         return {
             "demo_points": self.points[None, frames].float(),
             "demo_state": self.state[None, frames],
-            "demo_action": (self.undoing if backwards else self.action)[None, frames],
+            "demo_action": self.action[None, frames],
         }
 
-    def batch(
-        self, n: int, generator: torch.Generator, backwards: bool = False, mirror: bool = False
-    ) -> dict[str, Tensor]:
-        """Draws one reference demonstration, and n windows of other episodes.
+    def batch(self, n: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draws one reference demonstration, and n windows of other episodes than that.
 
-        `backwards` plays both from their last frame to the first, with actions that undo: another
-        task in the same scene. `mirror` exchanges left and right in both.
         Returns what `sample` and `demonstration` do.
         """
         reference = self.draw_episode(generator)
-        demo = self.demonstration(reference, backwards)
-        windows = self.sample(n, generator, backwards, without=reference)
+        demo = self.demonstration(reference)
+        windows = self.sample(n, generator, without=reference)
         if self.positions:
-            demo = self.augment(demo, generator, mirror, prefix="demo_")
-            windows = self.augment(windows, generator, mirror)
+            demo = self.augment(demo, generator, prefix="demo_")
+            windows = self.augment(windows, generator)
         return windows | demo
 
     def augment(
-        self,
-        scenes: dict[str, Tensor],
-        generator: torch.Generator,
-        mirror: bool = False,
-        prefix: str = "",
+        self, scenes: dict[str, Tensor], generator: torch.Generator, prefix: str = ""
     ) -> dict[str, Tensor]:
         """Moves each of n scenes elsewhere: points (n, T, N, 3), state (n, T, S), action (n, ., A).
 
@@ -389,7 +387,7 @@ class WindowSampler:
         """
         names = [f"{prefix}{part}" for part in ("points", "state", "action")]
         points, state, action = (scenes[name] for name in names)
-        a, b = draw_affine_maps(len(points), self.middle, generator, mirror)
+        a, b = draw_affine_maps(len(points), self.middle, generator)
         a, b = a.to(points.device), b.to(points.device)
 
         def place(x: Tensor) -> Tensor:

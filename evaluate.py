@@ -29,10 +29,11 @@ from torch import Tensor
 
 from clip import text_features
 from data import WindowSampler, load_demonstrations, write_atomically
-from model import DAMIPolicy, load_checkpoint
+from model import DAMIPolicy
 from scripts import (
     claim_folder,
     command_line,
+    load_checkpoint,
     pick_device,
     report_facts,
     run_jobs,

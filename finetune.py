@@ -27,8 +27,8 @@ import evaluate
 import scripts
 from clip import text_features
 from data import WindowSampler, load_demonstrations
-from model import DAMIPolicy, ema_model, load_checkpoint, save_checkpoint
-from scripts import Flags, command_line, progress_bar, setting
+from model import DAMIPolicy, ema_model
+from scripts import Flags, command_line, load_checkpoint, progress_bar, save_checkpoint, setting
 from simulator import INSTRUCTIONS, check_task, collect, suite_tasks
 
 LEARNING_RATES = {"vision": 1e-5, "diffusion": 3e-5, "other": 1e-4}  # AdamW's, by part

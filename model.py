@@ -24,13 +24,9 @@ for a wrong second derivative), without which the method can be read.
 
 import argparse
 import math
-import os
-import shutil
-import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -707,7 +703,7 @@ class DAMIPolicy(nn.Module):
         return {"noise": noise.to(device), "timesteps": timesteps.to(device)}
 
 
-# ---- Moving average and checkpoints --------------------------------------------------------------
+# ---- Moving average ------------------------------------------------------------------------------
 
 
 def ema_model(policy: DAMIPolicy) -> AveragedModel:
@@ -723,72 +719,6 @@ def ema_model(policy: DAMIPolicy) -> AveragedModel:
         torch._foreach_lerp_(averaged, current, 1 - decay)
 
     return AveragedModel(policy, multi_avg_fn=update)
-
-
-CHECKPOINT_FORMAT = "DAMI checkpoint 1"
-
-
-def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **info: Any) -> None:
-    """Writes configuration, weights, normalizer and `info` (tensors, plain values), atomically.
-
-    `half` stores the weights as float16, half the size; `load_checkpoint` gives float32 again.
-    """
-    path = Path(path)
-    weights = policy.state_dict()
-    if not all(torch.isfinite(x).all() for x in weights.values()):
-        raise ValueError(f"{path} was not written: the weights are not finite, lower the rates")
-    if half:
-        weights |= {name: p.detach().half() for name, p in policy.named_parameters()}
-    config = asdict(policy.config)
-    config = {name: list(v) if isinstance(v, tuple) else v for name, v in config.items()}
-    content = {"format": CHECKPOINT_FORMAT, "config": config, "model": weights, **info}
-
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
-        torch.save(content, temporary)
-        os.replace(temporary, path)
-    except RuntimeError as error:  # how torch.save reports a full disk
-        free = shutil.disk_usage(path.parent).free / 1e6
-        raise OSError(f"cannot write {path}: {free:.1f} MB are free there; make room") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def load_checkpoint(
-    path: str | Path, device: str | torch.device = "cpu", needs: Sequence[str] = ()
-) -> tuple[DAMIPolicy, dict[str, Any]]:
-    """Rebuilds the policy of a checkpoint, in evaluation mode on `device`.
-
-    Returns (policy, info): info is everything else in the file. Raises ValueError for a file that
-    is missing, damaged, not one of ours, lacks a name in `needs`, or whose weights do not fit.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"no checkpoint at {path}: name a .pt file, or train one with train.py")
-    try:
-        with zipfile.ZipFile(path) as archive:  # torch.load does not look at the check sums
-            damaged = archive.testzip()
-        info = None if damaged else torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # torch raises many types here; each means it cannot be read
-        raise ValueError(f"{path} is damaged or no PyTorch checkpoint: use another file") from error
-
-    if damaged:
-        raise ValueError(f"{path} is damaged (in {damaged}): use another file")
-    ours = isinstance(info, dict) and info.get("format") == CHECKPOINT_FORMAT
-    missing = [name for name in needs if not ours or name not in info]
-    if not ours or missing:
-        lacks = f" (it lacks {', '.join(missing)})" if ours else ""
-        raise ValueError(f"{path} is not a file of train.py or finetune.py{lacks}: use such a one")
-    try:
-        config, weights = PolicyConfig(**info.pop("config")), info.pop("model")
-        with torch.device("meta"):  # no memory for a size that the file does not hold
-            DAMIPolicy(config).load_state_dict({k: x.to("meta") for k, x in weights.items()})
-        policy = DAMIPolicy(config).to(device)
-        policy.load_state_dict(weights)
-    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path}: weights and configuration do not fit: {reason}") from error
-    return policy.eval(), info
 
 
 # ---- Written out for speed, or for PyTorch's bug: skip this when reading the method --------------

@@ -54,8 +54,7 @@ from data import (
     load_demonstrations,
     save_demonstrations,
 )
-from model import load_checkpoint
-from scripts import command_line
+from scripts import command_line, load_checkpoint
 
 STATE_DIM = ACTION_DIM = 7
 

@@ -7,6 +7,7 @@ step at hand, work is shared among processes. Skip this file when reading the me
 import argparse
 import difflib
 import fcntl
+import hashlib
 import json
 import math
 import multiprocessing
@@ -14,16 +15,18 @@ import os
 import platform
 import queue
 import shlex
+import shutil
 import signal
 import sys
 import threading
 import time
 import warnings
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from dataclasses import field, fields, replace
+from dataclasses import asdict, field, fields, replace
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,9 +34,11 @@ from typing import Any, get_args
 
 import torch
 import torch.distributed as dist
+from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
-from data import write_atomically
+from data import WindowSampler, write_atomically
+from model import DAMIPolicy, PolicyConfig
 
 # ---- Settings: each said once, as a field --------------------------------------------------------
 
@@ -147,6 +152,112 @@ def report_facts(
     command = shlex.join(["python", script, *(sys.argv[1:] if argv is None else argv)])
     date = time.strftime("%Y-%m-%d")
     return {"hardware": hardware(device), "date": date, "command": command}
+
+
+# ---- Checkpoints ---------------------------------------------------------------------------------
+
+CHECKPOINT_FORMAT = "DAMI checkpoint 1"
+
+
+def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **info: Any) -> None:
+    """Writes configuration, weights, normalizer and `info` (tensors, plain values), atomically.
+
+    `half` stores the weights as float16, half the size; `load_checkpoint` gives float32 again.
+    """
+    path = Path(path)
+    weights = policy.state_dict()
+    if not all(torch.isfinite(x).all() for x in weights.values()):
+        raise ValueError(f"{path} was not written: the weights are not finite, lower the rates")
+    if half:
+        weights |= {name: p.detach().half() for name, p in policy.named_parameters()}
+    config = asdict(policy.config)
+    config = {name: list(v) if isinstance(v, tuple) else v for name, v in config.items()}
+    content = {"format": CHECKPOINT_FORMAT, "config": config, "model": weights, **info}
+
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        torch.save(content, temporary)
+        os.replace(temporary, path)
+    except RuntimeError as error:  # how torch.save reports a full disk
+        free = shutil.disk_usage(path.parent).free / 1e6
+        raise OSError(f"cannot write {path}: {free:.1f} MB are free there; make room") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_checkpoint(
+    path: str | Path, device: str | torch.device = "cpu", needs: Sequence[str] = ()
+) -> tuple[DAMIPolicy, dict[str, Any]]:
+    """Rebuilds the policy of a checkpoint, in evaluation mode on `device`.
+
+    Returns (policy, info): info is everything else in the file. Raises ValueError for a file that
+    is missing, damaged, not one of ours, lacks a name in `needs`, or whose weights do not fit.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"no checkpoint at {path}: name a .pt file, or train one with train.py")
+    try:
+        with zipfile.ZipFile(path) as archive:  # torch.load does not look at the check sums
+            damaged = archive.testzip()
+        info = None if damaged else torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # torch raises many types here; each means it cannot be read
+        raise ValueError(f"{path} is damaged or no PyTorch checkpoint: use another file") from error
+
+    if damaged:
+        raise ValueError(f"{path} is damaged (in {damaged}): use another file")
+    ours = isinstance(info, dict) and info.get("format") == CHECKPOINT_FORMAT
+    missing = [name for name in needs if not ours or name not in info]
+    if not ours or missing:
+        lacks = f" (it lacks {', '.join(missing)})" if ours else ""
+        raise ValueError(f"{path} is not a file of train.py or finetune.py{lacks}: use such a one")
+    try:
+        config, weights = PolicyConfig(**info.pop("config")), info.pop("model")
+        with torch.device("meta"):  # no memory for a size that the file does not hold
+            DAMIPolicy(config).load_state_dict({k: x.to("meta") for k, x in weights.items()})
+        policy = DAMIPolicy(config).to(device)
+        policy.load_state_dict(weights)
+    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path}: weights and configuration do not fit: {reason}") from error
+    return policy.eval(), info
+
+
+def digest(samplers: dict[str, WindowSampler]) -> str:
+    """A fingerprint of everything that is trained on."""
+    sha = hashlib.sha256()
+    for sampler in samplers.values():
+        for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
+            sha.update(part.cpu().numpy().tobytes())
+    return sha.hexdigest()
+
+
+def restore(
+    path: Path,
+    policy: DAMIPolicy,
+    ema: AveragedModel,
+    optimizer: torch.optim.Optimizer,
+    settings: Flags,
+    data: str,
+) -> dict[str, Any]:
+    """Puts all three in the state of last.pt; returns the rest of it: step, seconds, text_weights.
+
+    Raises ValueError if the run was started with other settings, or on other data (its digest).
+    """
+    device = policy.normalizer.action_scale.device
+    averaged, left = load_checkpoint(path, device, needs=("training", "data"))
+    old = left["arguments"] | asdict(averaged.config)
+    new = asdict(settings) | asdict(policy.config)
+    changed = [f"{k} {old.get(k)} -> {new[k]}" for k in new if old.get(k) != new[k]]
+    if changed:
+        what = f"other settings ({', '.join(changed)})"
+        raise ValueError(f"{path.parent} was started with {what}: give the old ones to resume it")
+    if left["data"] != data:
+        raise ValueError(f"{path.parent} was started on other recordings: bring those back")
+    policy.load_state_dict(left["training"]["policy"])
+    ema.module.load_state_dict(averaged.state_dict())
+    ema.n_averaged.copy_(left["training"]["n_averaged"])
+    optimizer.load_state_dict(left["training"]["optimizer"])
+    return left
 
 
 # ---- Folders of runs -----------------------------------------------------------------------------

@@ -17,7 +17,6 @@ processes without changing what they draw.
 """
 
 import argparse
-import hashlib
 import json
 import math
 import time
@@ -37,10 +36,10 @@ from torch.optim.swa_utils import AveragedModel
 import evaluate
 import scripts
 from clip import text_features
-from data import Demonstrations, WindowSampler, load_demonstrations
+from data import Demonstrations, WindowSampler, backwards, load_demonstrations
 from maml import meta_gradient
-from model import PRESETS, DAMIPolicy, PolicyConfig, ema_model, load_checkpoint, save_checkpoint
-from scripts import Flags, choose, command_line, progress_bar, setting
+from model import PRESETS, DAMIPolicy, PolicyConfig, ema_model
+from scripts import Flags, choose, command_line, progress_bar, save_checkpoint, setting
 from simulator import INSTRUCTIONS, SUITES, collect, suite_tasks
 
 # ---- Settings ------------------------------------------------------------------------------------
@@ -77,7 +76,6 @@ class Settings(Flags):
     backwards: float = setting(
         0.0, "share played backwards, without instruction: other tasks", least=0, most=1
     )
-    mirror: float = setting(0.0, "share mirrored, without instruction", least=0, most=1)
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
@@ -118,25 +116,25 @@ def task_batch(
     n: int,
     seed: tuple[int, ...],
     instruction_dropout: float = 0.0,
+    undone: WindowSampler | None = None,
     backwards: float = 0.0,
-    mirror: float = 0.0,
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
     Where the instruction names the task, nothing else need be read. In a share of the batches it
-    is therefore left out (zeros), and in another share the episodes are played backwards, too: a
-    task that only the demonstration tells, in scenes where another one is known.
+    is therefore left out (zeros), and another share comes from `undone`, the same episodes played
+    backwards, without it, too: a task that only the demonstration tells.
 
     Returns the keyword arguments of `policy.loss`. They follow from `seed` alone.
     """
     first, second = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     generator = torch.Generator().manual_seed(int(first))
-    drop, turn, flip = torch.rand(3, generator=torch.Generator().manual_seed(int(second)))
-    back = bool(turn < backwards) and sampler.undoing is not None
-    mirrored = bool(flip < mirror) and sampler.positions > 0
-    if back or mirrored or drop < instruction_dropout:
+    drop, turn = torch.rand(2, generator=torch.Generator().manual_seed(int(second)))
+    if undone is not None and turn < backwards:
+        sampler, text = undone, torch.zeros_like(text)
+    elif drop < instruction_dropout:
         text = torch.zeros_like(text)
-    windows = sampler.batch(n, generator, back, mirrored)
+    windows = sampler.batch(n, generator)
     return {"text": text[None], **windows, **policy.draw_noise_and_timesteps(n, generator)}
 
 
@@ -175,6 +173,7 @@ def meta_train(
     samplers: dict[str, WindowSampler],
     text: dict[str, Tensor],
     settings: Settings,
+    undone: dict[str, WindowSampler] | None = None,
     start: int = 0,
     rank: int = 0,
     world: int = 1,
@@ -183,6 +182,7 @@ def meta_train(
 
     Args:
         samplers, text: task -> its windows, and its instruction feature (text_dim,).
+        undone: task -> windows of the same episodes played backwards, where that can be.
         rank, world: this process's number, and how many share the tasks.
 
     Yields:
@@ -195,7 +195,8 @@ def meta_train(
     params = dict(policy.named_parameters())
     my_tasks = list(enumerate(samplers))[rank::world]
     n = settings.support + settings.query
-    hidden = settings.instruction_dropout, settings.backwards, settings.mirror
+    seed, dropout, undone = settings.seed, settings.instruction_dropout, undone or {}
+    hidden = {task: (dropout, undone.get(task), settings.backwards) for task in samplers}
     lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
     at_once = settings.vectorize if len(lengths) == 1 else 1  # stacking needs equal lengths
     multi_task_share = 1.0 if settings.maml == "off" else settings.multi_task_share
@@ -207,7 +208,7 @@ def meta_train(
     for step in range(start, settings.steps):  # lines 2, 22
         # A generator: the batches of `at_once` tasks are in memory, not those of all.
         batches = (  # lines 3 to 6, 9
-            task_batch(policy, samplers[task], text[task], n, (settings.seed, step, index), *hidden)
+            task_batch(policy, samplers[task], text[task], n, (seed, step, index), *hidden[task])
             for index, task in my_tasks
         )
 
@@ -295,44 +296,6 @@ def initialize(
     return policy, ema_model(policy), optimizer
 
 
-def digest(samplers: dict[str, WindowSampler]) -> str:
-    """A fingerprint of everything that is trained on."""
-    sha = hashlib.sha256()
-    for sampler in samplers.values():
-        for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
-            sha.update(part.cpu().numpy().tobytes())
-    return sha.hexdigest()
-
-
-def restore(
-    path: Path,
-    policy: DAMIPolicy,
-    ema: AveragedModel,
-    optimizer: torch.optim.Optimizer,
-    settings: Settings,
-    data: str,
-) -> dict[str, Any]:
-    """Puts all three in the state of last.pt; returns the rest of it: step, seconds, text_weights.
-
-    Raises ValueError if the run was started with other settings, or on other data (its digest).
-    """
-    device = policy.normalizer.action_scale.device
-    averaged, left = load_checkpoint(path, device, needs=("training", "data"))
-    old = left["arguments"] | asdict(averaged.config)
-    new = asdict(settings) | asdict(policy.config)
-    changed = [f"{k} {old.get(k)} -> {new[k]}" for k in new if old.get(k) != new[k]]
-    if changed:
-        what = f"other settings ({', '.join(changed)})"
-        raise ValueError(f"{path.parent} was started with {what}: give the old ones to resume it")
-    if left["data"] != data:
-        raise ValueError(f"{path.parent} was started on other recordings: bring those back")
-    policy.load_state_dict(left["training"]["policy"])
-    ema.module.load_state_dict(averaged.state_dict())
-    ema.n_averaged.copy_(left["training"]["n_averaged"])
-    optimizer.load_state_dict(left["training"]["optimizer"])
-    return left
-
-
 # ---- Command line --------------------------------------------------------------------------------
 
 
@@ -411,11 +374,17 @@ def run(
         task: WindowSampler(d, config, device, settings.after_success, settings.augment)
         for task, d in zip(tasks, recordings)
     }
+    played = {task: backwards(d, settings.after_success or 0) for task, d in zip(tasks, recordings)}
+    undone = {
+        task: WindowSampler(d, config, device, settings.after_success, settings.augment)
+        for task, d in played.items()
+        if d is not None and settings.backwards
+    }
     policy, ema, optimizer = initialize(config, settings, samplers, device)
-    data = digest(samplers)
+    data = scripts.digest(samplers)
     left = {"step": 0, "seconds": 0.0, "text_weights": None}
     if args.resume:
-        left = restore(folder / "last.pt", policy, ema, optimizer, settings, data)
+        left = scripts.restore(folder / "last.pt", policy, ema, optimizer, settings, data)
     start, seconds = left["step"], left["seconds"]
     said = [d.instruction for d in recordings]
     features, identity = text_features(said, args.clip_weights, left["text_weights"])
@@ -458,7 +427,7 @@ def run(
         measure(start)  # the run may have been stopped while it was measured
         began = saved = time.monotonic()
         for step, figures in meta_train(
-            policy, ema, optimizer, samplers, text, settings, start, rank, world
+            policy, ema, optimizer, samplers, text, settings, undone, start, rank, world
         ):
             seconds += time.monotonic() - began
             if leader:

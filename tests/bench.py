@@ -22,8 +22,8 @@ from data import Demonstrations, WindowSampler, farthest_point_sample, load_demo
 from evaluate import EPISODES_A_JOB, SHIPPED_CHECKPOINT, rollout
 from finetune import BATCH, adapt_policy
 from maml import adapt, meta_gradient
-from model import PRESETS, DAMIPolicy, PolicyConfig, load_checkpoint
-from scripts import hardware, pick_device
+from model import PRESETS, DAMIPolicy, PolicyConfig
+from scripts import hardware, load_checkpoint, pick_device
 from simulator import (
     MetaWorldPointCloudEnv,
     collect,

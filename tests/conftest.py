@@ -14,7 +14,6 @@ import torch
 
 import clip
 import evaluate
-import model
 import scripts
 import simulator
 import train
@@ -92,7 +91,7 @@ def fails(script, argv, capsys):
 
 def weights(path):
     """A checkpoint's state_dict and information."""
-    policy, info = model.load_checkpoint(path)
+    policy, info = scripts.load_checkpoint(path)
     return policy.state_dict(), info
 
 

@@ -19,6 +19,7 @@ import torch
 
 import data
 import model
+import scripts
 
 ROOT = Path(__file__).parents[1]
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
@@ -48,7 +49,7 @@ def same(a: object, b: object) -> bool:
 
 
 def read_checkpoint(path: Path) -> object:
-    policy, info = model.load_checkpoint(path)
+    policy, info = scripts.load_checkpoint(path)
     return dict(policy.state_dict()), info
 
 
@@ -126,7 +127,7 @@ def main(argv: list[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder, recordings = Path(name), Path(args.data)
         policy = model.DAMIPolicy(model.PRESETS["tiny"])
-        model.save_checkpoint(folder / "policy.pt", policy, step=1)
+        scripts.save_checkpoint(folder / "policy.pt", policy, step=1)
         small = data.load_demonstrations(recordings / "reach.npz").take(1)
         data.save_demonstrations(folder / "reach.npz", small)
         for path, read in (("policy.pt", read_checkpoint), ("reach.npz", read_recording)):

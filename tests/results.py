@@ -27,7 +27,7 @@ from evaluate import (
     mean_success,
     paper_success,
 )
-from model import load_checkpoint, save_checkpoint
+from scripts import load_checkpoint, save_checkpoint
 from simulator import suite_tasks
 
 ROOT = Path(__file__).parents[1]

@@ -289,22 +289,6 @@ def test_no_window_is_from_the_reference_demonstration_unless_it_is_the_only_one
     assert (alone["state"] == alone["demo_state"][0, 0]).all()
 
 
-def test_a_mirrored_batch_moves_left_where_the_other_moves_right(monkeypatch):
-    for bound in ("TURN", "STRETCH"):
-        monkeypatch.setattr(data, bound, 0)
-    monkeypatch.setattr(data, "SHIFT", (0, 0, 0))
-    meta = {"positions_in_state": 3}
-    sampler = WindowSampler(replace(recording((40, 40)), meta=meta), SIZES, augment=True)
-    plain, mirrored = (sampler.batch(8, seeded(), mirror=mirror) for mirror in (False, True))
-    flip, x = torch.tensor([-1.0, 1, 1]), torch.tensor([1.0, 0, 0])
-    for part in ("points", "demo_points"):
-        expected = plain[part] * flip + 2 * x * sampler.middle
-        torch.testing.assert_close(mirrored[part], expected, atol=1e-5, rtol=0)
-    for part in ("action", "demo_action"):
-        torch.testing.assert_close(mirrored[part][..., :3], plain[part][..., :3] * flip)
-        assert torch.equal(mirrored[part][..., 3], plain[part][..., 3])
-
-
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -467,21 +451,21 @@ def test_backwards_the_actions_undo_what_the_episode_did():
     for episode in (slice(0, 60), slice(60, 100)):
         state[episode, :3] = 0.01 * np.cumsum(action[episode, :3], axis=0)
         state[episode, :3] -= 0.01 * action[episode, :3]  # a frame is seen before its action
-    meta = {"positions_in_state": 3}
-    sampler = WindowSampler(replace(demonstrations, state=state, meta=meta), SIZES)
+    meta = {"positions_in_state": 3, "success_frames": [25, 39]}
+    there = replace(demonstrations, state=state, meta=meta)
+    assert data.backwards(demonstrations) is None  # which tells neither
+    back = data.backwards(there, rest=10)
+    back.validate("played backwards")
+    assert back.episode_ends.tolist() == there.episode_ends.tolist()
+    assert back.meta["success_frames"] == [25, 29]
 
-    windows = sampler.sample(50, seeded(), backwards=True)
-    forwards = sampler.sample(50, seeded())
-    frames = sampler.windows[torch.randperm(len(sampler), generator=seeded())[:50]]
-    assert torch.equal(windows["points"][:, 0], sampler.points[frames[:, -1]].float())
-    assert not torch.equal(windows["points"], forwards["points"])
-    moved = windows["state"][:, 1, :3] - windows["state"][:, 0, :3]
-    inside = frames[:, -1] != frames[:, -2]  # not padding
-    expected = 0.01 * windows["action"][:, 0, :3]
-    torch.testing.assert_close(moved[inside], expected[inside], atol=2e-3, rtol=0.15)
-    assert torch.equal(windows["action"][inside, 0, 3], sampler.action[frames[inside, -2], 3])
-
-    there, back = (sampler.demonstration(0, backwards) for backwards in (False, True))
-    assert torch.equal(back["demo_points"], there["demo_points"].flip(1))
-    assert torch.equal(back["demo_state"], there["demo_state"].flip(1))
-    assert not torch.equal(back["demo_action"], there["demo_action"].flip(1))
+    for start, last, stop in ((0, 35, 60), (60, 99, 100)):  # the last frame that is played
+        played = slice(start, start + last - start + 1)
+        np.testing.assert_array_equal(back.points[played], there.points[start : last + 1][::-1])
+        assert (back.state[played.stop : stop] == there.state[start]).all()  # rests where it began
+        assert (back.action[played.stop - 1 : stop, :3] == 0).all()
+        moved = np.diff(back.state[played, :3], axis=0)
+        expected = 0.01 * back.action[played][:-1, :3]
+        np.testing.assert_allclose(moved, expected, atol=2e-3, rtol=0.15)
+        asked = there.action[start:last, 3][::-1]
+        np.testing.assert_array_equal(back.action[played][:-1, 3], asked)

@@ -55,7 +55,7 @@ def test_the_default_is_the_newest_finished_run_of_the_suite_that_is_not_tiny(ca
         arguments = {"preset": preset, "suite": suite, "steps": steps}
         Path(f"runs/{name}").mkdir(parents=True)
         Path(f"runs/{name}/config.json").write_text(json.dumps({"arguments": arguments}))
-        model.save_checkpoint(f"runs/{name}/ema-{last:05d}.pt", policy)
+        scripts.save_checkpoint(f"runs/{name}/ema-{last:05d}.pt", policy)
 
     leave("a-tiny", preset="tiny")
     leave("b-unfinished", last=4)

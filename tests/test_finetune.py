@@ -11,6 +11,7 @@ from conftest import fails, fingerprint, metrics, same_bits, weights
 import evaluate
 import finetune
 import model
+import scripts
 
 pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
 
@@ -184,7 +185,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(run, recorded, capsys):
     Path("cut.pt").write_bytes((run / "ema-00006.pt").read_bytes()[:1000])
     torch.save(info | {"text_weights": "openai-ViT-B-32-40d36571"}, "clip.pt")
     policy = model.DAMIPolicy(model.PRESETS["tiny"])
-    model.save_checkpoint("bare.pt", policy)
+    scripts.save_checkpoint("bare.pt", policy)
     messages = {
         "shape.pt": "weights and configuration do not fit",
         "cut.pt": "damaged",

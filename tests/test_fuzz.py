@@ -5,12 +5,13 @@ import torch
 
 import data
 import model
+import scripts
 from tests import fuzz
 
 
 def test_no_damage_to_a_checkpoint_goes_unnoticed(tmp_path):
     policy = model.DAMIPolicy(model.PRESETS["tiny"])
-    model.save_checkpoint(tmp_path / "policy.pt", policy, step=1)
+    scripts.save_checkpoint(tmp_path / "policy.pt", policy, step=1)
     assert fuzz.fuzz_file(tmp_path / "policy.pt", fuzz.read_checkpoint, 200) > 180
 
 
@@ -25,7 +26,7 @@ def test_weights_that_are_not_finite_are_not_saved(tmp_path):
     with torch.no_grad():
         policy.unet.head[1].weight[0] = torch.nan
     with pytest.raises(ValueError, match="not finite"):
-        model.save_checkpoint(tmp_path / "policy.pt", policy)
+        scripts.save_checkpoint(tmp_path / "policy.pt", policy)
     assert not list(tmp_path.iterdir())
 
 
@@ -35,11 +36,11 @@ def test_weights_that_are_not_finite_are_not_saved(tmp_path):
 )
 def test_an_edited_configuration_is_refused_before_memory_is_taken(tmp_path, changes):
     path = tmp_path / "policy.pt"
-    model.save_checkpoint(path, model.DAMIPolicy(model.PRESETS["tiny"]))
+    scripts.save_checkpoint(path, model.DAMIPolicy(model.PRESETS["tiny"]))
     content = torch.load(path, weights_only=True)
     torch.save(content | {"config": content["config"] | changes}, path)
     with pytest.raises(ValueError, match="do not fit"):
-        model.load_checkpoint(path)
+        scripts.load_checkpoint(path)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from diffusers.models.embeddings import get_timestep_embedding
 
 import data
 import model
+import scripts
 from model import (
     PRESETS,
     Conv1d,
@@ -499,10 +500,10 @@ def test_a_checkpoint_gives_back_policy_normalizer_and_information(tmp_path):
     policy = new_policy(demo_encoder="mlp", tcfm="up")
     batch = random_batch(policy.config)
     policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
-    model.save_checkpoint(
+    scripts.save_checkpoint(
         tmp_path / "a.pt", policy, step=7, text_weights="random-seed-0", arguments={"lr": 1e-3}
     )
-    again, info = model.load_checkpoint(tmp_path / "a.pt")
+    again, info = scripts.load_checkpoint(tmp_path / "a.pt")
     assert again.config == policy.config and not again.training
     assert (
         info["step"] == 7
@@ -518,8 +519,8 @@ def test_a_half_precision_checkpoint_is_half_as_large_and_acts_nearly_alike(tmp_
     batch = random_batch(policy.config)
     policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
     for name, half in (("whole.pt", False), ("half.pt", True)):
-        model.save_checkpoint(tmp_path / name, policy, half=half)
-    again, _ = model.load_checkpoint(tmp_path / "half.pt")
+        scripts.save_checkpoint(tmp_path / name, policy, half=half)
+    again, _ = scripts.load_checkpoint(tmp_path / "half.pt")
     assert (tmp_path / "half.pt").stat().st_size < 0.6 * (tmp_path / "whole.pt").stat().st_size
     assert all(x.dtype == torch.float32 for x in again.state_dict().values())
     assert all(
@@ -542,7 +543,7 @@ def bad_checkpoints(folder, good):
             (folder / name).write_bytes(content)
     torch.save({"weights": torch.zeros(3)}, folder / "foreign")
     torch.save([1, 2], folder / "list")
-    torch.save({"format": model.CHECKPOINT_FORMAT, "model": print}, folder / "pickled")
+    torch.save({"format": scripts.CHECKPOINT_FORMAT, "model": print}, folder / "pickled")
     info = torch.load(good, weights_only=True)
     torch.save(info | {"config": info["config"] | {"unet_widths": [32, 64]}}, folder / "shape")
     torch.save(info | {"config": info["config"] | {"flavor": 1}}, folder / "newer")
@@ -562,10 +563,10 @@ def bad_checkpoints(folder, good):
 
 
 def test_a_checkpoint_that_cannot_be_used_is_refused_in_one_line(tmp_path):
-    model.save_checkpoint(tmp_path / "good.pt", new_policy())
+    scripts.save_checkpoint(tmp_path / "good.pt", new_policy())
     for name, message in bad_checkpoints(tmp_path, tmp_path / "good.pt").items():
         with pytest.raises(ValueError) as error:
-            model.load_checkpoint(tmp_path / name)
+            scripts.load_checkpoint(tmp_path / name)
         assert (
             message in str(error.value)
             and name in str(error.value)
@@ -578,9 +579,9 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "ran"),)
 
-    torch.save({"format": model.CHECKPOINT_FORMAT, "config": Bomb()}, tmp_path / "bomb.pt")
+    torch.save({"format": scripts.CHECKPOINT_FORMAT, "config": Bomb()}, tmp_path / "bomb.pt")
     with pytest.raises(ValueError):
-        model.load_checkpoint(tmp_path / "bomb.pt")
+        scripts.load_checkpoint(tmp_path / "bomb.pt")
     assert not (tmp_path / "ran").exists()
 
 
@@ -590,7 +591,7 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
 def test_a_failing_save_leaves_the_old_checkpoint_and_no_temporary_file(
     tmp_path, monkeypatch, failure
 ):
-    model.save_checkpoint(tmp_path / "a.pt", new_policy(), step=1)
+    scripts.save_checkpoint(tmp_path / "a.pt", new_policy(), step=1)
 
     def half(_, path):
         Path(path).write_bytes(b"half")
@@ -598,8 +599,8 @@ def test_a_failing_save_leaves_the_old_checkpoint_and_no_temporary_file(
 
     monkeypatch.setattr(torch, "save", half)
     with pytest.raises((OSError, KeyboardInterrupt)):
-        model.save_checkpoint(tmp_path / "a.pt", new_policy(seed=1), step=2)
-    assert model.load_checkpoint(tmp_path / "a.pt")[1]["step"] == 1
+        scripts.save_checkpoint(tmp_path / "a.pt", new_policy(seed=1), step=2)
+    assert scripts.load_checkpoint(tmp_path / "a.pt")[1]["step"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
 
 

@@ -861,7 +861,7 @@ def robot_policy(path, **changes):
         "text_weights": "random-seed-0",
         "step": 0,
     }
-    model.save_checkpoint(path, policy, **info)
+    scripts.save_checkpoint(path, policy, **info)
 
 
 def test_running_moves_the_arm_within_its_limits_and_ends_with_a_stop(emulator, cell, capsys):
