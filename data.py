@@ -3,9 +3,8 @@
     python data.py --show data/reach.npz        # draws a recording to a PNG
 
 Nothing here knows a simulator or a robot: simulator.py and robot.py record, and so may you. A file
-is checked when it is read (`Demonstrations.validate`), `WindowSampler` holds it as tensors, and its
-`batch` draws what `DAMIPolicy.loss` takes. The file imports nothing from the project and can be
-copied out alone.
+is checked when it is read, `WindowSampler` holds it as tensors, and its `batch` draws what
+`DAMIPolicy.loss` takes beside the instruction and noise. Nothing of the project is imported.
 
 Letters: W windows, T demonstration frames, F stored frames, N points, E episodes, H = 16 horizon,
 To = 2 observation steps, Ta = 8 executed actions, A action dim, S state dim, M points to sample.
@@ -67,12 +66,12 @@ class Demonstrations:
         return len(self.episode_ends)
 
     def episode(self, index: int) -> slice:
-        """Returns the frames of one episode."""
+        """The frames of one episode."""
         ends = [0, *self.episode_ends.tolist()]
         return slice(ends[index], ends[index + 1])
 
     def take(self, n: int | None) -> "Demonstrations":
-        """Returns the first n episodes (views, no copies); None: all."""
+        """The first n episodes (views, no copies); None: all."""
         if n is None:
             return self
         if not 1 <= n <= len(self):
@@ -81,13 +80,8 @@ class Demonstrations:
         arrays = {name: getattr(self, name)[:end] for name in ("points", "state", "action")}
         return replace(self, **arrays, episode_ends=self.episode_ends[:n])
 
-    def validate(self, name: str) -> None:
-        """Raises ValueError, with `name` in it, for what cannot be trained on."""
-        if problem := self.problem():
-            raise ValueError(f"{name}: {problem}")
-
     def problem(self) -> str | None:
-        """Returns what is wrong with these arrays; None if nothing is."""
+        """What keeps these arrays from being trained on; None if nothing does."""
         arrays = {part: getattr(self, part) for part in ("points", "state", "action")}
         for part, array in arrays.items():
             dims = 3 if part == "points" else 2
@@ -142,8 +136,9 @@ PARTS = [part.name for part in fields(Demonstrations)]
 
 
 def save_demonstrations(path: str | Path, demonstrations: Demonstrations) -> None:
-    """Writes one task's demonstrations as an `.npz` file, atomically."""
-    demonstrations.validate(str(path))
+    """Writes one task's demonstrations as an `.npz` file; ValueError if they have a problem."""
+    if problem := demonstrations.problem():
+        raise ValueError(f"{path}: {problem}")
     arrays = {part: getattr(demonstrations, part) for part in PARTS}
     arrays["meta"] = json.dumps(demonstrations.meta)
 
@@ -163,9 +158,9 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path} is missing: collect it with `python simulator.py`, or record it")
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path} is truncated or no .npz file: delete it and collect it again")
     try:
+        if not zipfile.is_zipfile(path):
+            raise ValueError("it is truncated, delete it and collect it again")
         with np.load(path, allow_pickle=False) as file:
             missing = [part for part in PARTS if part not in file.files]
             arrays = {part: file[part] for part in PARTS if part not in missing}
@@ -178,7 +173,8 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
 
     task, instruction = str(arrays.pop("task")), str(arrays.pop("instruction"))
     demonstrations = Demonstrations(task, instruction, **arrays, meta=meta)
-    demonstrations.validate(str(path))
+    if problem := demonstrations.problem():
+        raise ValueError(f"{path}: {problem}")
     return demonstrations
 
 
@@ -250,7 +246,9 @@ class WindowSampler:
 
     A window may begin To - 1 frames before an episode and end Ta - 1 frames after it, the edge
     frames repeated: 193 windows in an episode of 200 frames. An episode too short for a window
-    keeps one (DP3 drops it). The clouds are held once, as float16.
+    keeps one. The clouds are held once, as float16. All that is drawn is float32: n windows are
+    points (n, To, N, 3), state (n, To, S) and action (n, H, A), a demonstration is demo_points
+    (1, T, N, 3), demo_state (1, T, S) and demo_action (1, T, A).
 
     Args:
         demonstrations: of one task.
@@ -325,7 +323,6 @@ class WindowSampler:
         """Draws n different windows (with repetition only where there are fewer than n).
 
         None is of the episode `without`, unless that is the only one.
-        Returns points (n, To, N, 3), state (n, To, S), action (n, H, A), all float32.
         """
         others = (self.episode_of != without).nonzero()[:, 0]
         count, device = len(others) or len(self), generator.device
@@ -336,7 +333,7 @@ class WindowSampler:
         return self.gather(others[chosen.cpu()] if len(others) else chosen)
 
     def gather(self, indices: Tensor) -> dict[str, Tensor]:
-        """Returns the windows of these indices (n,), as `sample` does."""
+        """The windows of these indices (n,)."""
         frames = self.windows[indices.to(self.windows.device)]  # (n, H)
         observed = frames[:, : self.config.n_obs_steps]  # (n, To)
         return {
@@ -346,16 +343,11 @@ class WindowSampler:
         }
 
     def draw_episode(self, generator: torch.Generator) -> int:
-        """Draws the number of an episode."""
         n, device = len(self.episodes), generator.device
         return int(torch.randint(n, (1,), generator=generator, device=device))
 
     def demonstration(self, episode: int) -> dict[str, Tensor]:
-        """Returns a complete episode, every demo_stride-th frame of it.
-
-        Returns demo_points (1, T, N, 3), demo_state (1, T, S), demo_action (1, T, A), all float32:
-        what `DAMIPolicy.encode_demo` takes.
-        """
+        """A complete episode, every demo_stride-th frame of it, as `encode_demo` takes it."""
         whole = self.episodes[episode]
         frames = slice(whole.start, whole.stop, self.config.demo_stride)
         return {
@@ -365,10 +357,7 @@ class WindowSampler:
         }
 
     def batch(self, n: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """Draws one reference demonstration, and n windows of other episodes than that.
-
-        Returns what `sample` and `demonstration` do.
-        """
+        """Draws a reference demonstration, and n windows of other episodes where there are any."""
         reference = self.draw_episode(generator)
         demo = self.demonstration(reference)
         windows = self.sample(n, generator, without=reference)
@@ -380,7 +369,7 @@ class WindowSampler:
     def augment(
         self, scenes: dict[str, Tensor], generator: torch.Generator, prefix: str = ""
     ) -> dict[str, Tensor]:
-        """Moves each of n scenes elsewhere: points (n, T, N, 3), state (n, T, S), action (n, ., A).
+        """Puts each scene elsewhere.
 
         Points and the positions in a state move together, and the displacement that an action
         begins with turns and stretches with them: the scene stays one of the same task.
@@ -438,7 +427,7 @@ def draw_demonstration(
     write_atomically(out, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
 
 
-# ---- Command lines -------------------------------------------------------------------------------
+# ---- Command line --------------------------------------------------------------------------------
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:

@@ -27,6 +27,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import scripts
 from clip import text_features
 from data import WindowSampler, load_demonstrations, write_atomically
 from model import DAMIPolicy
@@ -298,6 +299,17 @@ def evaluate(
     return results
 
 
+def evaluate_step(folder: Path, step: int, *arguments: Any) -> Successes:
+    """`evaluate` of a run's checkpoint, logged in metrics.jsonl, unless it was done before."""
+    for line in (folder / "metrics.jsonl").read_text().splitlines():
+        values = json.loads(line)
+        if values["step"] == step and "successes" in values:
+            return values["successes"]
+    successes = evaluate(folder / f"ema-{step:05d}.pt", *arguments)
+    scripts.log(folder, step=step, success=mean_success(successes), successes=successes)
+    return successes
+
+
 # ---- Reports -------------------------------------------------------------------------------------
 
 
@@ -472,7 +484,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--checkpoint", nargs="+", help="files or run folders (default: the newest run's last)")
     add("--suite", help="ml10 or ml45 (default: the checkpoint's, or ml10)")
     add("--split", choices=("base", "novel", "all"), default="base", help="which of its tasks")
-    add("--task", help="only this task")
+    add("--task", nargs="+", help="only these tasks, of any suite")
     add("--data", default="data", help="folder of the demonstrations (default: data)")
     add("--demonstrations", type=int, default=10, help="demonstrations a task (default: 10)")
     add("--episodes", type=int, default=20, help="episodes a task (default: 20)")
@@ -485,9 +497,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
-    add("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
-    add("--workers", type=int, help="processes (default: one a core)")
-    add("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as in the checkpoint)")
+    scripts.add_common_flags(add)
     add("--gif", metavar="FILE", help="write one rollout of --task as an animation instead")
     return parser.parse_args(argv)
 
@@ -495,10 +505,10 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 def choose_tasks(args: argparse.Namespace, suite: str, info: dict[str, Any]) -> list[str]:
     """The tasks to measure: --task, the one a policy was adapted to, or those of the split."""
     adapted = info.get("adapted_to")
-    if args.task and adapted not in (None, args.task):
-        raise ValueError(f"this policy was adapted to {adapted}, not to {args.task}")
+    if args.task and adapted and args.task != [adapted]:
+        raise ValueError(f"this policy was adapted to {adapted}, not to {' '.join(args.task)}")
     if args.task or adapted:
-        return [check_task(args.task or adapted)]
+        return [check_task(task) for task in args.task or [adapted]]
     if suite == "own":
         raise ValueError("a policy of own recordings has no simulator to be measured in")
     base, novel = suite_tasks(suite)
@@ -519,7 +529,7 @@ def main(argv: list[str] | None = None) -> None:
     if args.top < 0:
         raise ValueError(f"--top is {args.top}: use at least 0")
     evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after collecting
-    if args.gif and not (args.task and args.gif.endswith(".gif")):
+    if args.gif and not (args.task and len(args.task) == 1 and args.gif.endswith(".gif")):
         raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
     if args.gif and not Path(args.gif).resolve().parent.is_dir():
         raise ValueError(f"there is no folder to write {args.gif} into")
@@ -546,7 +556,7 @@ def main(argv: list[str] | None = None) -> None:
         raise ValueError("--swap needs the tasks of a split, and the last checkpoint alone")
     out = Path(args.out)
     if not args.gif:
-        claim_folder(out, "success.json", args.overwrite)
+        claim_folder(out, args.overwrite)
     paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
     recorded = {task: load_demonstrations(paths[task]).take(args.demonstrations) for task in tasks}
     instructions = [recorded[task].instruction for task in tasks]
@@ -554,9 +564,9 @@ def main(argv: list[str] | None = None) -> None:
     text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
 
     if args.gif:
-        sampler = WindowSampler(recorded[args.task], policy.config, device)
-        success = write_gif(policy, sampler, text[args.task], args.seed, args.gif)
-        print(f"{args.task}: {'success' if success else 'failure'}; wrote {args.gif}")
+        sampler = WindowSampler(recorded[tasks[0]], policy.config, device)
+        success = write_gif(policy, sampler, text[tasks[0]], args.seed, args.gif)
+        print(f"{tasks[0]}: {'success' if success else 'failure'}; wrote {args.gif}")
         return
 
     blank = "demonstration" in args.without
@@ -575,7 +585,7 @@ def main(argv: list[str] | None = None) -> None:
             label = f"{labels[checkpoint]}, {part} of another task"
             swapped[label] = evaluate(checkpoint, *inputs.values(), *protocol)
 
-    facts = {"title": tasks[0] if len(tasks) == 1 else f"{suite}, {args.split} tasks"}
+    facts = {"title": " ".join(args.task or []) or f"{suite}, {args.split} tasks"}
     facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
     facts |= report_facts("evaluate.py", argv, device)
     means = [[mean_success(results[checkpoint]) for checkpoint in run] for run in runs]

@@ -15,7 +15,7 @@ import argparse
 import copy
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -59,12 +59,11 @@ def adapt_policy(
     policy: DAMIPolicy,
     sampler: WindowSampler,
     text: Tensor,
-    steps: int = 200,
-    batch: int = 108,
-    learning_rates: dict[str, float] = LEARNING_RATES,
+    steps: int,
+    batch: int,
+    learning_rates: dict[str, float],
     seed: int = 0,
-    on_step: Callable[[int, float], None] | None = None,
-) -> DAMIPolicy:
+) -> Iterator[tuple[int, float, DAMIPolicy]]:
     """Adapts a copy of a policy to the demonstrations of one task (Algorithm 2, lines 2 to 17).
 
     Args:
@@ -74,20 +73,18 @@ def adapt_policy(
         steps, batch: gradient steps, and windows in each.
         learning_rates: of the parameter groups `vision`, `diffusion` and `other`.
         seed: of batches, demonstrations and noise.
-        on_step: called with (steps done, loss) after each.
 
-    Returns:
-        The moving average of the adapted policy, in evaluation mode.
+    Yields:
+        (steps done, loss, the moving average of the adapted policy) after each step.
 
     Raises:
         ValueError: the loss is not finite.
     """
     adapted = copy.deepcopy(policy).train()  # line 2
     average = ema_model(adapted)
+    average.module.eval()
     parts = adapted.parameter_groups()
-    groups = [
-        {"params": parts[name], "lr": lr} for name, lr in learning_rates.items() if parts[name]
-    ]
+    groups = [{"params": parts[p], "lr": lr} for p, lr in learning_rates.items() if parts[p]]
     optimizer = torch.optim.AdamW(groups, betas=(0.95, 0.999), weight_decay=1e-6, fused=True)
     generator = torch.Generator().manual_seed(seed)
 
@@ -104,22 +101,25 @@ def adapt_policy(
         torch.nn.utils.clip_grad_norm_(adapted.parameters(), 1.0)
         optimizer.step()  # line 15
         average.update_parameters(adapted)  # line 16
-        if on_step is not None:
-            on_step(step, loss.item())
-    return average.module.eval()
+        yield step, loss.item(), average.module
 
 
 # ---- From files to files -------------------------------------------------------------------------
 
 
 def adapt_checkpoint(
-    checkpoint: Path, data: Path, text: Tensor, folder: Path, settings: Settings
+    checkpoint: Path,
+    data: Path,
+    text: Tensor,
+    folder: Path,
+    settings: Settings,
+    curve: Sequence[int] = (),
 ) -> dict[str, Any]:
     """Adapts the policy of a checkpoint to the task of a recording, on the device of `text`.
 
-    Writes adapted.pt (a checkpoint like any other), metrics.jsonl and config.json to `folder`, and
-    returns what config.json says: the settings used, with the preset's in place of None, and
-    `seconds` spent on the steps. Raises ValueError where the two files do not fit each other.
+    Writes adapted.pt (a checkpoint like any other; after the steps in `curve` adapted-STEP.pt),
+    metrics.jsonl and config.json to `folder`, and returns what config.json says: the settings used,
+    and the `seconds` of the steps. Raises ValueError where the two files do not fit each other.
     """
     policy, info = load_checkpoint(checkpoint, text.device, needs=evaluate.TRAINED)
     demonstrations = load_demonstrations(data).take(settings.demonstrations)
@@ -133,28 +133,25 @@ def adapt_checkpoint(
     given = {part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES}
     rates = {p: lr * scale if given[p] is None else given[p] for p, lr in LEARNING_RATES.items()}
     batch = settings.batch or BATCH[info["preset"]]
+    used = asdict(settings) | {"batch": batch, "learning_rates": rates}
+    about = {name: info[name] for name in evaluate.TRAINED} | {"adaptation": used}
+    about |= {"adapted_to": demonstrations.task, "instruction": demonstrations.instruction}
 
-    losses = []
+    scripts.rewind_metrics(folder, 0)
+    seconds, began = 0.0, time.monotonic()
     bar = {"desc": f"adapting to {demonstrations.task}", "unit": "step"}
+    training = adapt_policy(policy, sampler, text, settings.steps, batch, rates, settings.seed)
     with progress_bar(total=settings.steps, **bar) as progress:
-
-        def on_step(step: int, loss: float) -> None:
-            losses.append(loss)
+        for step, loss, adapted in training:
+            seconds += time.monotonic() - began
             progress.set_postfix(loss=f"{loss:.4f}")
             progress.update()
+            scripts.log(folder, step=step, loss=loss)
+            if step in curve:
+                save_checkpoint(folder / f"adapted-{step:05d}.pt", adapted, **about)
+            began = time.monotonic()
 
-        began = time.monotonic()
-        steps, seed = settings.steps, settings.seed
-        adapted = adapt_policy(policy, sampler, text, steps, batch, rates, seed, on_step)
-        seconds = time.monotonic() - began
-
-    used = asdict(settings) | {"batch": batch, "learning_rates": rates}
-    kept = {name: info[name] for name in evaluate.TRAINED}
-    about = {"adapted_to": demonstrations.task, "instruction": demonstrations.instruction}
-    save_checkpoint(folder / "adapted.pt", adapted, **kept, **about, adaptation=used)
-    scripts.rewind_metrics(folder, 0)
-    for step, loss in enumerate(losses, start=1):
-        scripts.log(folder, step=step, loss=loss)
+    save_checkpoint(folder / "adapted.pt", adapted, **about)
     written = {"checkpoint": str(checkpoint), "data": str(data), **used, "seconds": seconds}
     scripts.write_text(folder / "config.json", json.dumps(written, indent=1))
     return written
@@ -166,15 +163,14 @@ def adapt_checkpoint(
 def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Adapts a policy to one task (Algorithm 2).")
     add = parser.add_argument_group("run").add_argument
-    add("--task", help="a Meta-World task, or `novel`: all novel tasks of the suite")
+    add("--task", nargs="+", help="tasks of Meta-World, or `novel`: the novel ones of the suite")
     add("--suite", default="ml10", help="of the run to start from, and of `novel` (default: ml10)")
     add("--data", default="data", help="folder of the demonstrations, or one file (default: data)")
     add("--checkpoint", help="file or run folder to start from (default: the newest run's last)")
+    add("--curve", nargs="+", type=int, default=[], help="roll out after these steps, too")
     add("--out", help="folder of the adapted policy (default: runs/finetune/TASK-seedSEED)")
     add("--overwrite", action="store_true", help="replace what is in that folder")
-    add("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
-    add("--workers", type=int, help="processes for collecting and evaluating (default: one a core)")
-    add("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as in the checkpoint)")
+    scripts.add_common_flags(add)
     Settings.add_flags(parser.add_argument_group("settings"))
     return parser.parse_args(argv)
 
@@ -184,16 +180,18 @@ def main(argv: list[str] | None = None) -> None:
     settings = Settings().given(args)
     device = scripts.pick_device(args.device)
 
-    # Which tasks, from which policy: a recording of one's own, one task, or all novel tasks
+    # Which tasks, from which policy: a recording of one's own, tasks by name, or all novel ones
     file = Path(args.data) if args.data.endswith(".npz") else None
     if args.task is None and file is None:
         raise ValueError("name a task of Meta-World with --task, or a recording with --data")
     if file is not None:
         tasks = [load_demonstrations(file).task]
-        if args.task not in (None, *tasks):
-            raise ValueError(f"{file} is a recording of {tasks[0]}, not of {args.task}")
+        if args.task not in (None, tasks):
+            raise ValueError(f"{file} is a recording of {tasks[0]}, not of {args.task[0]}")
+    elif args.task == ["novel"]:
+        tasks = suite_tasks(args.suite)[1]
     else:
-        tasks = suite_tasks(args.suite)[1] if args.task == "novel" else [check_task(args.task)]
+        tasks = [check_task(task) for task in args.task]
     simulated = all(task in INSTRUCTIONS for task in tasks)
     start = args.checkpoint or evaluate.default_checkpoint(args.suite if simulated else "own")
     checkpoint = evaluate.checkpoints_of(start)[-1]
@@ -201,11 +199,12 @@ def main(argv: list[str] | None = None) -> None:
     where = f"{device} ({scripts.hardware(device)})"
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {where}", flush=True)
 
-    # Folders, demonstrations and instructions
-    folder = Path(args.out or f"runs/finetune/{args.task or tasks[0]}-seed{settings.seed}")
-    folders = {task: folder / task if args.task == "novel" else folder for task in tasks}
-    for path in folders.values():
-        scripts.claim_folder(path, "adapted.pt", args.overwrite)
+    # Folders (one a task, if there are several), demonstrations and instructions
+    name = tasks[0] if len(tasks) == 1 else "-".join(args.task)
+    folder = Path(args.out or f"runs/finetune/{name}-seed{settings.seed}")
+    folders = {task: folder / task if len(tasks) > 1 else folder for task in tasks}
+    for path in {folder, *folders.values()}:
+        scripts.claim_folder(path, args.overwrite)
     if file is None:
         settings = replace(settings, demonstrations=settings.demonstrations or 10)
         paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
@@ -215,27 +214,33 @@ def main(argv: list[str] | None = None) -> None:
     features, identity = text_features(instructions, args.clip_weights, info["text_weights"])
     text = dict(zip(tasks, features.to(device) * settings.instruction))  # each (text_dim,)
 
-    columns, seconds = {"before": {}, "after": {}}, 0.0
+    # Each task before, in between if asked for, and after
+    between = sorted({step for step in args.curve if 0 < step < settings.steps})
+    columns = {"before": checkpoint}
+    columns |= {f"{step} steps": f"adapted-{step:05d}.pt" for step in between}
+    columns["after"] = "adapted.pt"
+    results, seconds = {column: {} for column in columns}, 0.0
     for task in tasks:
-        adapted = folders[task] / "adapted.pt"
-        used = adapt_checkpoint(checkpoint, paths[task], text[task], folders[task], settings)
-        seconds += used["seconds"]
-        print(f"adapted to {task} in {used['seconds']:.1f} s; wrote {adapted}", flush=True)
+        arguments = checkpoint, paths[task], text[task], folders[task], settings, between
+        took = adapt_checkpoint(*arguments)["seconds"]
+        seconds += took
+        print(
+            f"adapted to {task} in {took:.1f} s; wrote {folders[task] / 'adapted.pt'}", flush=True
+        )
         if simulated and settings.episodes:
             protocol = (settings.episodes, settings.seed, args.workers, device)
-            for column, policy in {"before": checkpoint, "after": adapted}.items():
-                columns[column] |= evaluate.evaluate(
-                    policy, {task: paths[task]}, text, *protocol, settings.demonstrations
-                )
-    if not columns["after"]:
+            for column, policy in columns.items():
+                of_task = {task: paths[task]}, text, *protocol, settings.demonstrations
+                results[column] |= evaluate.evaluate(folders[task].resolve() / policy, *of_task)
+    if not results["after"]:
         return  # own recordings have no simulator to be rolled out in
 
-    facts = {"title": f"{args.task}: before and after {settings.steps} steps"}
+    facts = {"title": f"{name}: before and after {settings.steps} steps"}
     facts |= {"checkpoint": str(checkpoint), "seconds a task": round(seconds / len(tasks), 1)}
-    facts |= {name: getattr(settings, name) for name in ("steps", "demonstrations", "episodes")}
-    facts |= {"seed": settings.seed, "text weights": identity}
+    kept = ("steps", "demonstrations", "episodes", "seed", "instruction")
+    facts |= {"text weights": identity} | {name: getattr(settings, name) for name in kept}
     facts |= scripts.report_facts("finetune.py", argv, device)
-    print(f"\n{evaluate.write_report(folder, columns, facts, info['suite'])}")
+    print(f"\n{evaluate.write_report(folder, results, facts, info['suite'])}")
 
 
 if __name__ == "__main__":

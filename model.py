@@ -10,19 +10,16 @@ r"""The policy: what it reads, how it turns that into actions, how it is kept.
 
 VMT: visual-motor trajectory encoder. U2T: unpaired unified task encoder. TCFM: task-conditioned
 feature modulation. FiLM: feature-wise linear modulation. `python model.py` prints every size.
-The file reads from small blocks to `DAMIPolicy`, imports nothing of the project, can be copied out.
+The file reads from small blocks to `DAMIPolicy` and imports nothing of the project. Its last
+section, PyTorch's layers written out for speed, can be skipped.
 
 Letters: B windows, G windows that share one demonstration, D demonstrations (B = D * G), T frames
-of a demonstration, N points, To = 2 observation steps, H = 16 horizon, Ta = 8 executed actions, A
-action dim, S state dim, K = 100 diffusion steps, C condition width (timestep_dim + To * observation
-feature), L length of the action sequence inside the U-Net (H, then half of it a level).
-Clouds and poses are in metres; actions, like all that networks see, in [-1, 1] after `Normalizer`.
-
-LayerNorm, GroupNorm, Conv1d and Mish are PyTorch's, written out in the last section (for speed, and
-for a wrong second derivative), without which the method can be read.
+of a demonstration, N points (W winning ones), To = 2 observation steps, H = 16 horizon, Ta = 8
+executed actions, A action dim, S state dim, K = 100 diffusion steps, C condition width
+(timestep_dim + To * observation feature), L length of the action sequence inside the U-Net (H, then
+half of it a level). Clouds and poses are in metres; all that networks see is in [-1, 1].
 """
 
-import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,12 +34,14 @@ from torch.optim.swa_utils import AveragedModel
 # ---- Configuration -------------------------------------------------------------------------------
 
 
+CHOICES = {"demo_encoder": ("vmt", "mlp", "none"), "tcfm": ("down", "mid", "up", "none")}
+
+
 @dataclass(frozen=True)
 class PolicyConfig:
-    """The whole architecture. It is stored in every checkpoint, and the policy is rebuilt from it.
+    """The whole architecture, from which a checkpoint's policy is rebuilt.
 
-    The defaults are those of the paper's hyperparameter table; what it leaves out (PointNet, the
-    widths and the kernel of the U-Net) is DP3's.
+    The defaults are the paper's; what it leaves out (PointNet, the U-Net's widths) is DP3's.
     """
 
     state_dim: int = 9  # S: end effector, right finger, left finger, metres
@@ -79,18 +78,13 @@ class PolicyConfig:
         for name, value in vars(self).items():
             if isinstance(value, int) and not 1 <= value <= 100_000:
                 raise ValueError(f"{name} is {value}: use at least 1, at most 100000")
-        choices = {"demo_encoder": ("vmt", "mlp", "none"), "tcfm": ("down", "mid", "up", "none")}
-        for name, known in choices.items():
-            if getattr(self, name) not in known:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)!r}; use one of {', '.join(known)}"
-                )
+        for name, known in CHOICES.items():
+            if (value := getattr(self, name)) not in known:
+                raise ValueError(f"{name} is {value!r}; use one of {', '.join(known)}")
 
         H, To, Ta = self.horizon, self.n_obs_steps, self.n_action_steps
         if Ta > (most := H - To + 1):
-            raise ValueError(
-                f"n_action_steps {Ta}: horizon {H} has {most} from observation {To} on"
-            )
+            raise ValueError(f"n_action_steps {Ta}: horizon {H} has {most} after observation {To}")
         shrink = 2 ** (len(self.unet_widths) - 1)  # the U-Net halves the sequence between levels
         for whole, part, what in [
             (self.horizon, shrink, "horizon by 2 for each level of the U-Net but the last"),
@@ -245,7 +239,7 @@ class VisualMotorTrajectory(nn.Module):
 
 
 class DemonstrationMLP(nn.Module):
-    """The ablation of VMT: an MLP on every frame, averaged over time. It keeps no order."""
+    """The ablation of VMT: an MLP on every frame, averaged over time."""
 
     def __init__(self, config: PolicyConfig):
         super().__init__()
@@ -262,10 +256,9 @@ class UnpairedUnifiedTask(nn.Module):
     """U2T: fuses demonstration, instruction and h_k, and is read at h_k's place (Eqs. 6 and 8).
 
     The sequence is [demonstration tokens | text token | h_k]. Only h_k differs from window to
-    window and from one diffusion step to the next. In the first layer the keys and values of the
-    other tokens therefore belong to the task alone: `encode_context` computes them once, and every
-    window attends to the same ones. With one layer (the default) that is exact and complete.
-    Further layers mix the tokens and run on the full sequence, as the paper writes it.
+    window and from one diffusion step to the next. With one layer (the default) the keys and values
+    of the other tokens therefore belong to the task alone: `encode_context` computes them once, and
+    every window attends to the same ones. More layers mix the tokens and run on the full sequence.
     """
 
     def __init__(self, config: PolicyConfig):
@@ -288,7 +281,7 @@ class UnpairedUnifiedTask(nn.Module):
         return tokens
 
     def encode_context(self, demo_tokens: Tensor | None, text: Tensor) -> tuple[Tensor, ...]:
-        """What a task's windows share: keys, values (D, heads, T + 1, C / heads), or the tokens."""
+        """What a task's windows share: keys, values (D, heads, T + 1, C / heads); or the tokens."""
         tokens = self.embed(demo_tokens, text)
         if len(self.blocks) > 1:
             return (tokens,)
@@ -302,7 +295,10 @@ class UnpairedUnifiedTask(nn.Module):
         """
         if len(self.blocks) > 1:
             tokens = context[0].repeat_interleave(len(h) // len(context[0]), dim=0)  # (B, T + 1, C)
-            return self.full_sequence(h, tokens)
+            x = torch.cat([tokens, h[:, None]], dim=1)  # (B, T + 2, C)
+            for block in self.blocks:
+                x = block(x)
+            return x[:, -1]
 
         block, attention = self.blocks[0], self.blocks[0].attention
         keys, values = context  # (D, heads, T + 1, d), with d = C / heads
@@ -319,13 +315,6 @@ class UnpairedUnifiedTask(nn.Module):
         x = x + attention.merge(fused)  # (D, G, C)
         x = x + block.mlp(block.norm2(x))
         return x.flatten(0, 1)  # (B, C)   Eq. 8
-
-    def full_sequence(self, h: Tensor, tokens: Tensor) -> Tensor:
-        """The same, written as in the paper: h (B, C), tokens (B, T + 1, C) -> (B, C)."""
-        x = torch.cat([tokens, h[:, None]], dim=1)  # (B, T + 2, C)
-        for block in self.blocks:
-            x = block(x)
-        return x[:, -1]
 
 
 class PooledTask(nn.Module):
@@ -378,8 +367,8 @@ class ConditionalUNet1d(nn.Module):
     """DP3's 1D U-Net over time, with task-conditioned feature modulation (TCFM).
 
     Every residual block is modulated by h_k = MLP([timestep embedding, observation features])
-    (Eq. 7), but for the two blocks of the level that `tcfm` names, which take U2T's output instead
-    (Eq. 10): the first down-sampling level (`down`, the paper's), the middle (`mid`) or the last
+    (Eq. 7), but for the two blocks of the level that `tcfm` names, which take U2T's output (Eq.
+    10): the first down-sampling level (`down`, the paper's), the middle (`mid`) or the last
     up-sampling level (`up`). DP3 has no MLP: there h_k is the concatenation itself.
     """
 
@@ -565,14 +554,9 @@ class DAMIPolicy(nn.Module):
     ) -> Context:
         """Encodes what names a task. It depends on no observation: once a rollout is enough.
 
-        Args:
-            text: instruction features, (D, text_dim).
-            demo_points, demo_state, demo_action: complete reference demonstrations, already
-                strided, (D, T, N, 3) in metres, (D, T, S), (D, T, A). More frames than learned
-                positions raise ValueError.
-
-        Returns:
-            The context that `loss` and `sample_actions` condition on.
+        Takes instruction features (D, text_dim), and complete demonstrations, already strided:
+        (D, T, N, 3) in metres, (D, T, S), (D, T, A). Returns what `loss` and `sample_actions`
+        condition on. Raises ValueError for more frames than learned positions.
         """
         config = self.config
         if not config.reads_task:
@@ -604,29 +588,25 @@ class DAMIPolicy(nn.Module):
         points: Tensor,
         state: Tensor,
         action: Tensor,
-        noise: Tensor | None = None,
-        timesteps: Tensor | None = None,
+        noise: Tensor,
+        timesteps: Tensor,
         **task: Tensor,
     ) -> Tensor:
         """The diffusion loss, () float: squared error of the predicted clean actions (Eq. 1).
 
         It is the mean over windows and over a window's H * A numbers, as in DP3's code. The paper
         writes a squared norm, their sum: 64 times as much at H = 16, A = 4. AdamW does not feel the
-        factor, an SGD inner step does. With `noise` and `timesteps` given the loss is a pure
-        function of the parameters and its arguments.
+        factor, an SGD inner step does. The loss is a pure function of parameters and arguments.
 
         Args:
             points, state, action: B windows, the older observation first, ordered by task:
                 (B, To, N, 3) in metres, (B, To, S), (B, H, A).
             noise, timesteps: standard normal (B, H, A), and k in [0, K), (B,) int64.
-            task: text, demo_points, demo_state, demo_action of D tasks, the arguments of
-                `encode_demo`; D divides B.
+            task: the arguments of `encode_demo`, of D tasks; D divides B.
         """
-        self.check_shapes(points, state, action, noise, timesteps)
+        self.check_shapes(points, state, action=action, noise=noise, timesteps=timesteps)
         context = self.encode_demo(**task)
         clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
-        if noise is None or timesteps is None:
-            noise, timesteps = self.draw_noise_and_timesteps(len(clean)).values()
         noisy = self.schedule.add_noise(clean, noise, timesteps)  # A_k, (B, H, A)
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
         return F.mse_loss(self.denoise(noisy, timesteps, observation, context), clean)
@@ -643,14 +623,9 @@ class DAMIPolicy(nn.Module):
     ) -> Tensor:
         """Draws an action chunk by DDIM from Gaussian noise.
 
-        Args:
-            points, state: the last To observations, the older first, (B, To, N, 3) in metres,
-                (B, To, S).
-            context: from `encode_demo`, of D tasks; D divides B.
-            generator: source of the initial noise, on any device.
-
-        Returns:
-            (B, Ta, A), to be executed from the newest observation on, in the demonstrations' unit.
+        Takes the last To observations, the older first, (B, To, N, 3) in metres and (B, To, S), the
+        context of D tasks, and the source of the initial noise. Returns (B, Ta, A), to be executed
+        from the newest observation on, in the demonstrations' unit.
         """
         config = self.config
         self.check_shapes(points, state)
@@ -667,39 +642,26 @@ class DAMIPolicy(nn.Module):
         chunk = actions[:, newest : newest + config.n_action_steps]  # (B, Ta, A)
         return self.normalizer.unnormalize("action", chunk)
 
-    def check_shapes(
-        self,
-        points: Tensor,
-        state: Tensor,
-        action: Tensor | None = None,
-        noise: Tensor | None = None,
-        timesteps: Tensor | None = None,
-    ) -> None:
+    def check_shapes(self, points: Tensor, state: Tensor, **others: Tensor) -> None:
         """Raises ValueError for shapes that would broadcast to a wrong result without an error."""
         config, B = self.config, len(points)
-        chunk = (B, config.horizon, config.action_dim)
-        points_shape = (B, config.n_obs_steps, *points.shape[2:3], 3)  # any number of points
-        for name, x, shape in (
-            ("points", points, points_shape),
-            ("state", state, (B, config.n_obs_steps, config.state_dim)),
-            ("action", action, chunk),
-            ("noise", noise, chunk),
-            ("timesteps", timesteps, (B,)),
-        ):
-            if x is not None and x.shape != shape:
-                raise ValueError(f"{name} is {tuple(x.shape)}, the policy takes {shape}")
-
-    def draw_noise_and_timesteps(
-        self, windows: int, generator: torch.Generator | None = None
-    ) -> dict[str, Tensor]:
-        """Draws what makes `loss` pure: noise (windows, H, A) and timesteps (windows,) int64."""
-        config, device = self.config, self.normalizer.action_scale.device
-        drawn = {
-            "generator": generator,
-            "device": device if generator is None else generator.device,
+        expected = {
+            "points": (B, config.n_obs_steps, *points.shape[2:3], 3),  # any number of points
+            "state": (B, config.n_obs_steps, config.state_dim),
+            "action": (B, config.horizon, config.action_dim),
+            "noise": (B, config.horizon, config.action_dim),
+            "timesteps": (B,),
         }
-        noise = torch.randn(windows, config.horizon, config.action_dim, **drawn)
-        timesteps = torch.randint(config.diffusion_steps, (windows,), **drawn)
+        for name, x in {"points": points, "state": state, **others}.items():
+            if x.shape != expected[name]:
+                raise ValueError(f"{name} is {tuple(x.shape)}, the policy takes {expected[name]}")
+
+    def draw_noise_and_timesteps(self, n: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draws what makes `loss` pure: noise (n, H, A) and timesteps (n,) int64."""
+        config, device = self.config, self.normalizer.action_scale.device
+        source = {"generator": generator, "device": generator.device}
+        noise = torch.randn(n, config.horizon, config.action_dim, **source)
+        timesteps = torch.randint(config.diffusion_steps, (n,), **source)
         return {"noise": noise.to(device), "timesteps": timesteps.to(device)}
 
 
@@ -709,8 +671,8 @@ class DAMIPolicy(nn.Module):
 def ema_model(policy: DAMIPolicy) -> AveragedModel:
     """The exponential moving average of a policy in training; the averaged policy is its `.module`.
 
-    `.update_parameters(policy)` belongs after each step. The decay grows, min(0.9999,
-    1 - (1 + step)^-0.75): the paper's EMA power and maximum.
+    `.update_parameters(policy)` belongs after each step. The decay grows: min(0.9999,
+    1 - (1 + step)^-0.75), the paper's.
     """
 
     @torch.no_grad()
@@ -766,9 +728,8 @@ class Conv1d(nn.Conv1d):
         """(B, d_in, L) -> (B, d_out, L)."""
         if x.is_cuda or not self.wide:
             return super().forward(x)
-        padded = F.pad(x, (self.padding[0], self.padding[0])).transpose(
-            1, 2
-        )  # (B, L + k - 1, d_in)
+        pad = self.padding[0]
+        padded = F.pad(x, (pad, pad)).transpose(1, 2)  # (B, L + k - 1, d_in)
         shifted = [padded[:, i : i + x.shape[-1]] for i in range(self.kernel_size[0])]
         windows = torch.stack(shifted, dim=-1).flatten(2)  # (B, L, d_in * k)
         return F.linear(windows, self.weight.flatten(1), self.bias).transpose(1, 2)
@@ -829,12 +790,10 @@ class WinningPoints(torch.autograd.Function):
 
 def main() -> None:
     """Prints the size of every module of each preset."""
-    argparse.ArgumentParser(description=main.__doc__).parse_args()
     for preset, config in PRESETS.items():
         with torch.device("meta"):  # weights are neither drawn nor stored
-            modules = {preset: DAMIPolicy(config)}
-        modules |= dict(modules[preset].named_children())
-        for name, module in modules.items():
+            policy = DAMIPolicy(config)
+        for name, module in [(preset, policy), *policy.named_children()]:
             print(f"{name:<20} {sum(p.numel() for p in module.parameters()):>12,}")
 
 

@@ -80,6 +80,13 @@ class Flags:
 # ---- Command lines -------------------------------------------------------------------------------
 
 
+def add_common_flags(add: Callable[..., Any]) -> None:
+    """Adds the flags that training, adaptation and evaluation share."""
+    add("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
+    add("--workers", type=int, help="processes for collecting and evaluating (default: one a core)")
+    add("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as before, or download)")
+
+
 def choose(name: str, names: Iterable[str], what: str) -> str:
     """Returns `name` if it is one of `names`; otherwise ValueError with the nearest right one."""
     names = sorted(names)
@@ -263,20 +270,24 @@ def restore(
 # ---- Folders of runs -----------------------------------------------------------------------------
 
 
-RESULT_FILES = "adapted.pt", "config.json", "metrics.jsonl"
-RESULT_FILES += "success.json", "success.md", "success.png"
+RESULTS = "adapted.pt", "adapted-*.pt", "success.json", "success.md", "success.png"
+OF_ADAPTING = "config.json", "metrics.jsonl"
 
 
-def claim_folder(folder: Path, kept: str, overwrite: bool) -> None:
-    """Makes a folder for results; ValueError if `kept` is in it and may not be overwritten.
+def claim_folder(folder: Path, overwrite: bool) -> None:
+    """Makes a folder for results; ValueError if there are any, or a run, that would be lost.
 
-    With `overwrite` old results go, so that none of them stands beside new ones.
+    With `overwrite` old results go, so that none of them stands beside new ones. A training run
+    is never overwritten.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if (folder / kept).exists() and not overwrite:
-        raise ValueError(f"{folder} already holds {kept}: add --overwrite, or choose another --out")
-    for name in RESULT_FILES:
-        (folder / name).unlink(missing_ok=True)
+    if any(folder.glob("ema-*.pt")) or (folder / "last.pt").exists():
+        raise ValueError(f"{folder} holds a training run: choose another --out")
+    old = [path for name in RESULTS + OF_ADAPTING for path in folder.glob(name)]
+    if old and not overwrite:
+        raise ValueError(f"{folder} already holds {old[0].name}: add --overwrite, or another --out")
+    for path in old:
+        path.unlink()
 
 
 @contextmanager
@@ -323,12 +334,11 @@ def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int,
 class StopRequest:
     """Turns Ctrl-C, SIGTERM and a closed terminal into a request to stop after the step at hand.
 
-    A second one stops at once, as does the first while `at_once` is set.
+    A second one stops at once, as does the first within `at_once`.
     """
 
     def __enter__(self) -> "StopRequest":
-        self.requested = self.at_once = False
-        self.previous = {}
+        self.requested, self.previous = False, {}
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) != signal.SIG_IGN:  # `nohup` has it ignored
                 self.previous[number] = signal.signal(number, self.handle)
@@ -339,9 +349,15 @@ class StopRequest:
             signal.signal(number, handler)
 
     def handle(self, *_: Any) -> None:
-        if self.requested or self.at_once:
+        if self.requested:
             raise KeyboardInterrupt
         self.requested = True
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        self.requested, before = True, self.requested
+        yield
+        self.requested = before
 
 
 def log(folder: Path, **values: Any) -> None:
@@ -364,13 +380,6 @@ def is_whole(line: str) -> bool:
         return isinstance(json.loads(line)["step"], int)
     except (ValueError, TypeError, KeyError):
         return False
-
-
-def logged_successes(folder: Path, step: int) -> dict[str, list[bool]] | None:
-    """What was measured after a step, if it was."""
-    lines = (folder / "metrics.jsonl").read_text().splitlines()
-    found = [values for values in map(json.loads, lines) if values["step"] == step]
-    return next((values["successes"] for values in found if "successes" in values), None)
 
 
 # ---- Worker processes, for collecting and for evaluating -----------------------------------------

@@ -7,10 +7,6 @@
     python train.py --data recordings                   # own tasks: every recording in a folder
     torchrun --nproc-per-node 4 train.py --suite ml10   # tasks shared among 4 processes
 
-One batch, from disk to the loss: `task_batch` draws windows and a reference demonstration from a
-`data.WindowSampler`, `maml.meta_gradient` takes the inner step and calls `model.DAMIPolicy.loss`,
-first on the support windows, then on the query windows.
-
 Whatever is random in outer step k follows from (seed, k, task) alone. A run that was killed and
 resumed therefore ends with the same bits as one that was not, and tasks may be shared among
 processes without changing what they draw.
@@ -38,7 +34,7 @@ import scripts
 from clip import text_features
 from data import Demonstrations, WindowSampler, backwards, load_demonstrations
 from maml import meta_gradient
-from model import PRESETS, DAMIPolicy, PolicyConfig, ema_model
+from model import CHOICES, PRESETS, DAMIPolicy, PolicyConfig, ema_model
 from scripts import Flags, choose, command_line, progress_bar, save_checkpoint, setting
 from simulator import INSTRUCTIONS, SUITES, collect, suite_tasks
 
@@ -62,20 +58,12 @@ class Settings(Flags):
     inner_lr: float = setting(1e-4, "learning rate of the inner step", least=0)
     lr: float = setting(1e-4, "peak learning rate of AdamW", least=0)
     warmup: int = setting(500, "steps of linear warm-up", least=0)
-    multi_task_share: float = setting(
-        0.0, "share of the steps, the first ones, that take no inner step", least=0, most=1
-    )
+    multi_task_share: float = setting(0.0, "first steps without an inner step", least=0, most=1)
     vectorize: int = setting(1, "tasks that run at once; memory is for so many", least=1)
-    after_success: int | None = setting(
-        None, "windows begin at most so many frames after the success", least=0
-    )
+    after_success: int | None = setting(None, "frames that windows may begin later", least=0)
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
-    instruction_dropout: float = setting(
-        0.0, "share of the batches that see no instruction", least=0, most=1
-    )
-    backwards: float = setting(
-        0.0, "share played backwards, without instruction: other tasks", least=0, most=1
-    )
+    instruction_dropout: float = setting(0.0, "share of batches without it", least=0, most=1)
+    backwards: float = setting(0.0, "share of batches played backwards", least=0, most=1)
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
@@ -112,17 +100,16 @@ PER_WINDOW = ("points", "state", "action", "noise", "timesteps")  # of a batch; 
 def task_batch(
     policy: DAMIPolicy,
     sampler: WindowSampler,
+    undone: WindowSampler | None,
     text: Tensor,
     n: int,
     seed: tuple[int, ...],
-    instruction_dropout: float = 0.0,
-    undone: WindowSampler | None = None,
-    backwards: float = 0.0,
+    settings: Settings,
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
     Where the instruction names the task, nothing else need be read. In a share of the batches it
-    is therefore left out (zeros), and another share comes from `undone`, the same episodes played
+    is therefore left out (zeros). Another share comes from `undone`, the same episodes played
     backwards, without it, too: a task that only the demonstration tells.
 
     Returns the keyword arguments of `policy.loss`. They follow from `seed` alone.
@@ -130,9 +117,9 @@ def task_batch(
     first, second = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     generator = torch.Generator().manual_seed(int(first))
     drop, turn = torch.rand(2, generator=torch.Generator().manual_seed(int(second)))
-    if undone is not None and turn < backwards:
+    if undone is not None and turn < settings.backwards:
         sampler, text = undone, torch.zeros_like(text)
-    elif drop < instruction_dropout:
+    elif drop < settings.instruction_dropout:
         text = torch.zeros_like(text)
     windows = sampler.batch(n, generator)
     return {"text": text[None], **windows, **policy.draw_noise_and_timesteps(n, generator)}
@@ -159,8 +146,9 @@ def multi_task_gradient(
     return dict(zip(parameters, gradients)), loss.detach()[None]
 
 
-def learning_rate(step: int, steps: int, peak: float, warmup: int) -> float:
-    """Linear warm-up over `warmup` steps, then half a cosine down to zero at `steps`."""
+def learning_rate(step: int, settings: Settings) -> float:
+    """Linear warm-up, then half a cosine down to zero at the last step."""
+    peak, steps, warmup = settings.lr, settings.steps, settings.warmup
     if step < warmup:
         return peak * (step + 1) / warmup
     return peak * 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
@@ -194,41 +182,37 @@ def meta_train(
     """
     params = dict(policy.named_parameters())
     my_tasks = list(enumerate(samplers))[rank::world]
-    n = settings.support + settings.query
-    seed, dropout, undone = settings.seed, settings.instruction_dropout, undone or {}
-    hidden = {task: (dropout, undone.get(task), settings.backwards) for task in samplers}
-    lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
-    at_once = settings.vectorize if len(lengths) == 1 else 1  # stacking needs equal lengths
+    seed, n, undone = settings.seed, settings.support + settings.query, undone or {}
     multi_task_share = 1.0 if settings.maml == "off" else settings.multi_task_share
     multi_task_steps = round(multi_task_share * settings.steps)
+
+    # Several tasks at once, if their demonstrations can be stacked.
+    lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
+    at_once = settings.vectorize if len(lengths) == 1 else 1
+    inner = {"lr": settings.inner_lr, "first_order": settings.maml == "first", "vectorize": at_once}
 
     def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         return functional_call(policy, params, (), batch)
 
     for step in range(start, settings.steps):  # lines 2, 22
-        # A generator: the batches of `at_once` tasks are in memory, not those of all.
+        # A generator: the inner loop below keeps the batches of `at_once` tasks in memory, not all.
         batches = (  # lines 3 to 6, 9
-            task_batch(policy, samplers[task], text[task], n, (seed, step, index), *hidden[task])
-            for index, task in my_tasks
+            task_batch(policy, samplers[t], undone.get(t), text[t], n, (seed, step, i), settings)
+            for i, t in my_tasks
         )
 
+        # The gradient of the mean loss over my tasks
         if step < multi_task_steps:
             gradients, losses = multi_task_gradient(policy, list(batches))
             figures = {}
         else:  # lines 4 to 19: the inner step on support, the gradient of the query loss through it
             pairs = (split(batch, settings.support) for batch in batches)
-            gradients, losses, before = meta_gradient(
-                loss_fn,
-                params,
-                pairs,
-                settings.inner_lr,
-                first_order=settings.maml == "first",
-                vectorize=at_once,
-            )
+            gradients, losses, before = meta_gradient(loss_fn, params, pairs, **inner)
             figures = {"loss_before": before.mean().item()}
         loss = losses.mean()
 
-        if world > 1:  # the mean over all tasks: the processes' means, weighted by their shares
+        # The mean over all tasks: the processes' means, weighted by their shares
+        if world > 1:
             for x in (loss, *gradients.values()):
                 dist.all_reduce(x.mul_(len(my_tasks) / len(samplers)))
         norm = torch.nn.utils.get_total_norm(gradients.values())
@@ -238,10 +222,10 @@ def meta_train(
                 "smaller --lr or --inner-lr, in another --out (what was saved before is whole)"
             )
 
+        # One step of AdamW, and of the moving average, which is what is kept and rolled out
         for name, parameter in params.items():
             parameter.grad = gradients[name]
-        peak = settings.lr
-        optimizer.param_groups[0]["lr"] = learning_rate(step, settings.steps, peak, settings.warmup)
+        optimizer.param_groups[0]["lr"] = learning_rate(step, settings)
         optimizer.step()  # line 20
         ema.update_parameters(policy)  # line 21
         yield step + 1, figures | {"loss": loss.item(), "gradient_norm": norm.item()}
@@ -305,15 +289,11 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--data", help="folder of the demonstrations (default: data)")
     add("--out", help="folder of the run (default: runs/SUITE-PRESET-seedSEED)")
     add("--resume", action="store_true", help="go on from the run's last.pt")
-    add("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
-    add("--workers", type=int, help="processes for collecting and evaluating (default: one a core)")
-    add("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: cache, or download)")
-
+    scripts.add_common_flags(add)
     add = parser.add_argument_group("architecture (default: the preset's)").add_argument
-    add("--demo-encoder", choices=("vmt", "mlp", "none"), help="encoder of the demonstration")
-    add("--tcfm", choices=("down", "mid", "up", "none"), help="the U-Net level that reads it")
+    add("--demo-encoder", choices=CHOICES["demo_encoder"], help="encoder of the demonstration")
+    add("--tcfm", choices=CHOICES["tcfm"], help="the U-Net level that reads it")
     add("--num-points", type=int, help="points of each cloud that the policy reads")
-
     Settings.add_flags(parser.add_argument_group("settings (default: the preset's)"))
     return parser.parse_args(argv)
 
@@ -365,35 +345,34 @@ def run(
 
     The leader, of rank 0, logs, saves, evaluates and reports.
     """
-    leader, tasks = rank == 0, list(paths)
+    leader = rank == 0
 
-    # Demonstrations, the policy, its windows, and the state in which the run was left
-    recordings = [load_demonstrations(paths[task]).take(settings.demonstrations) for task in tasks]
-    config = choose_config(args, settings.preset, recordings, settings.suite == "own")
-    samplers = {
-        task: WindowSampler(d, config, device, settings.after_success, settings.augment)
-        for task, d in zip(tasks, recordings)
-    }
-    played = {task: backwards(d, settings.after_success or 0) for task, d in zip(tasks, recordings)}
-    undone = {
-        task: WindowSampler(d, config, device, settings.after_success, settings.augment)
-        for task, d in played.items()
-        if d is not None and settings.backwards
-    }
+    # Demonstrations and their windows, the policy, and the state in which the run was left
+    n, rest = settings.demonstrations, settings.after_success
+    recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
+    config = choose_config(args, settings.preset, list(recorded.values()), settings.suite == "own")
+
+    def windows(demonstrations: dict[str, Demonstrations]) -> dict[str, WindowSampler]:
+        how = (config, device, rest, settings.augment)
+        return {task: WindowSampler(d, *how) for task, d in demonstrations.items() if d is not None}
+
+    samplers = windows(recorded)
+    reverse = settings.backwards > 0
+    undone = windows({task: backwards(d, rest or 0) for task, d in recorded.items() if reverse})
     policy, ema, optimizer = initialize(config, settings, samplers, device)
     data = scripts.digest(samplers)
     left = {"step": 0, "seconds": 0.0, "text_weights": None}
     if args.resume:
         left = scripts.restore(folder / "last.pt", policy, ema, optimizer, settings, data)
     start, seconds = left["step"], left["seconds"]
-    said = [d.instruction for d in recordings]
+    said = [d.instruction for d in recorded.values()]
     features, identity = text_features(said, args.clip_weights, left["text_weights"])
-    text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
+    text = dict(zip(recorded, features.to(device)))  # each (text_dim,)
 
     # What is written beside the weights, and beside the results
     about = {"suite": settings.suite, "preset": settings.preset, "text_weights": identity}
     about["arguments"] = asdict(settings)
-    facts = {"text_weights": identity, **facts}
+    facts = {"text weights": identity, **facts}
     if leader and start == 0:
         written = {"arguments": asdict(settings), "config": asdict(config), **facts}
         scripts.write_text(folder / "config.json", json.dumps(written, indent=1))
@@ -407,28 +386,23 @@ def run(
         save_checkpoint(folder / "last.pt", ema.module, **about, **now)
 
     def measure(step: int) -> evaluate.Successes | None:
-        """Evaluates the checkpoint of this step if that is due, unless it was done before."""
+        """Evaluates the checkpoint of this step if that is due, and was not done before."""
         due = step == settings.steps or (step and step % settings.evaluate_every == 0)
         if not leader or not settings.episodes or not due:
             return None
-        if (successes := scripts.logged_successes(folder, step)) is None:
-            stop.at_once = True  # everything is saved
-            protocol = (settings.episodes, EVALUATION_SEED, args.workers, device)
-            checkpoint, n = folder / f"ema-{step:05d}.pt", settings.demonstrations
-            successes = evaluate.evaluate(checkpoint, paths, text, *protocol, n)
-            stop.at_once = False
-            mean = evaluate.mean_success(successes)
-            scripts.log(folder, step=step, success=mean, successes=successes)
-        return successes
+        protocol = (settings.episodes, EVALUATION_SEED, args.workers, device, n)
+        with stop.at_once():  # everything is saved
+            return evaluate.evaluate_step(folder, step, paths, text, *protocol)
 
     bar = {"desc": "training", "unit": "step", "disable": not leader}
     bar |= {"total": settings.steps, "initial": start}
     with scripts.StopRequest() as stop, progress_bar(**bar) as progress:
         measure(start)  # the run may have been stopped while it was measured
         began = saved = time.monotonic()
-        for step, figures in meta_train(
+        training = meta_train(
             policy, ema, optimizer, samplers, text, settings, undone, start, rank, world
-        ):
+        )
+        for step, figures in training:
             seconds += time.monotonic() - began
             if leader:
                 progress.update()
