@@ -108,16 +108,18 @@ class Demonstrations:
             return f"positions_in_state is {positions!r}, a state has {self.state.shape[1]} numbers"
         if positions and self.action.shape[1] < 3:
             return "with positions_in_state an action must begin with a displacement"
+        if np.shape(self.meta.get("workspace") or np.zeros((2, 3))) != (2, 3):
+            return "workspace must be two corners of three numbers, metres"
         frames = self.meta.get("success_frames", [0] * len(ends))
         listed = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
         if not listed or len(frames) < len(ends):
             return "success_frames must be a list with one whole number for each episode"
 
         for part, array in arrays.items():
-            if not np.isfinite(array).all():
-                return f"{part} holds NaN or infinite numbers: record or collect it again"
-        if np.abs(self.points).max() > 1e4:
-            return "points reach beyond ten kilometres: write them in metres"
+            if not (np.isfinite(array).all() and float(np.abs(array).max()) < 1e30):
+                return f"{part} holds NaN or infinite numbers: record it again, in metres"
+        if np.abs(self.points).max() > 100:
+            return "points reach beyond 100 metres: write them in metres"
         return None
 
 
@@ -158,9 +160,9 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path} is missing: collect it with `python simulator.py`, or record it")
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path} is truncated or no .npz file: delete it and collect it again")
     try:
-        if not zipfile.is_zipfile(path):
-            raise ValueError("it is truncated, delete it and collect it again")
         with np.load(path, allow_pickle=False) as file:
             missing = [part for part in PARTS if part not in file.files]
             arrays = {part: file[part] for part in PARTS if part not in missing}
@@ -439,7 +441,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    out = args.out or Path(args.show).with_suffix(".png")
+    out = Path(args.out or args.show).with_suffix(".png")
     draw_demonstration(load_demonstrations(args.show), out)
     print(f"wrote {out}")
 

@@ -31,16 +31,7 @@ import scripts
 from clip import text_features
 from data import WindowSampler, load_demonstrations, write_atomically
 from model import DAMIPolicy
-from scripts import (
-    claim_folder,
-    command_line,
-    load_checkpoint,
-    pick_device,
-    report_facts,
-    run_jobs,
-    worker,
-    write_text,
-)
+from scripts import command_line, load_checkpoint, run_jobs, worker, write_text
 from simulator import MetaWorldPointCloudEnv, check_task, collect, evaluation_seed, suite_tasks
 
 EPISODES_A_JOB = 10  # side by side in one process; part of the protocol: it shapes the noise drawn
@@ -533,7 +524,7 @@ def main(argv: list[str] | None = None) -> None:
         raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
     if args.gif and not Path(args.gif).resolve().parent.is_dir():
         raise ValueError(f"there is no folder to write {args.gif} into")
-    device = pick_device(args.device)
+    device = scripts.pick_device(args.device)
 
     # Which checkpoints: of each run the last, or all of them for the mean of the best
     runs = [
@@ -554,9 +545,12 @@ def main(argv: list[str] | None = None) -> None:
     tasks = choose_tasks(args, suite, info)
     if args.swap and (len(tasks) < 2 or args.top):
         raise ValueError("--swap needs the tasks of a split, and the last checkpoint alone")
-    out = Path(args.out)
-    if not args.gif:
-        claim_folder(out, args.overwrite)
+    for checkpoint in labels:
+        _, each = load_checkpoint(checkpoint, needs=TRAINED)
+        if each["text_weights"] != info["text_weights"]:
+            raise ValueError(f"{checkpoint} was made with text weights {each['text_weights']!r}")
+        if each.get("adapted_to", tasks[0]) != tasks[0] or ("adapted_to" in each and tasks[1:]):
+            raise ValueError(f"{checkpoint} was adapted to {each['adapted_to']}: measure it alone")
     paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
     recorded = {task: load_demonstrations(paths[task]).take(args.demonstrations) for task in tasks}
     instructions = [recorded[task].instruction for task in tasks]
@@ -569,15 +563,33 @@ def main(argv: list[str] | None = None) -> None:
         print(f"{tasks[0]}: {'success' if success else 'failure'}; wrote {args.gif}")
         return
 
+    facts = {"title": " ".join(args.task or []) or f"{suite}, {args.split} tasks"}
+    facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
+    facts |= scripts.report_facts("evaluate.py", argv, device)
+    if args.without:
+        facts["without"] = " and ".join(args.without)
+        if "instruction" in args.without:
+            text = {task: torch.zeros_like(feature) for task, feature in text.items()}
+    with scripts.locked(Path(args.out)):
+        scripts.claim_folder(Path(args.out), args.overwrite)
+        measure(args, suite, runs, labels, paths, text, device, facts)
+
+
+def measure(
+    args: argparse.Namespace,
+    suite: str,
+    runs: list[list[Path]],
+    labels: dict[Path, str],
+    paths: dict[str, Path],
+    text: dict[str, Tensor],
+    device: torch.device,
+    facts: dict[str, Any],
+) -> None:
+    """Rolls out the checkpoints of all runs (path -> label), and reports."""
     blank = "demonstration" in args.without
-    if "instruction" in args.without:
-        text = {task: torch.zeros_like(feature) for task, feature in text.items()}
     protocol = (args.episodes, args.seed, args.workers, device, args.demonstrations, blank)
     results, swapped = {}, {}
     for checkpoint in labels:
-        _, info = load_checkpoint(checkpoint, needs=TRAINED)
-        if info["text_weights"] != identity:
-            raise ValueError(f"{checkpoint} was made with text weights {info['text_weights']!r}")
         results[checkpoint] = evaluate(checkpoint, paths, text, *protocol)
         for part in args.swap:
             inputs = {"demonstration": paths, "instruction": text}
@@ -585,19 +597,14 @@ def main(argv: list[str] | None = None) -> None:
             label = f"{labels[checkpoint]}, {part} of another task"
             swapped[label] = evaluate(checkpoint, *inputs.values(), *protocol)
 
-    facts = {"title": " ".join(args.task or []) or f"{suite}, {args.split} tasks"}
-    facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
-    facts |= report_facts("evaluate.py", argv, device)
     means = [[mean_success(results[checkpoint]) for checkpoint in run] for run in runs]
     facts["mean, last checkpoint"] = mean_interval([run[-1] for run in means])
     if args.top:
         best = [float(np.mean(sorted(run)[-args.top :])) for run in means]
         facts[f"mean, best {args.top} checkpoints"] = mean_interval(best)
-    if args.without:
-        facts["without"] = " and ".join(args.without)
     columns = {labels[run[-1]]: results[run[-1]] for run in runs} | swapped
     all_checkpoints = {labels[path]: found for path, found in results.items()} if args.top else None
-    print(f"\n{write_report(out, columns, facts, suite, all_checkpoints)}\n")
+    print(f"\n{write_report(Path(args.out), columns, facts, suite, all_checkpoints)}\n")
     for name, value in facts.items():
         print(f"{name}: {value}")
 

@@ -199,48 +199,48 @@ def main(argv: list[str] | None = None) -> None:
     where = f"{device} ({scripts.hardware(device)})"
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {where}", flush=True)
 
-    # Folders (one a task, if there are several), demonstrations and instructions
-    name = tasks[0] if len(tasks) == 1 else "-".join(args.task)
+    several = args.task is not None and (len(args.task) > 1 or args.task == ["novel"])
+    name = "-".join(args.task or tasks)
     folder = Path(args.out or f"runs/finetune/{name}-seed{settings.seed}")
-    folders = {task: folder / task if len(tasks) > 1 else folder for task in tasks}
-    for path in {folder, *folders.values()}:
-        scripts.claim_folder(path, args.overwrite)
+    folders = {task: folder / task if several else folder for task in tasks}
     if file is None:
         settings = replace(settings, demonstrations=settings.demonstrations or 10)
-        paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
-    else:
+
+    with scripts.locked(folder):
+        for path in {folder, *folders.values()}:
+            scripts.claim_folder(path, args.overwrite)
         paths = {tasks[0]: file}
-    instructions = [load_demonstrations(paths[task]).instruction for task in tasks]
-    features, identity = text_features(instructions, args.clip_weights, info["text_weights"])
-    text = dict(zip(tasks, features.to(device) * settings.instruction))  # each (text_dim,)
+        if file is None:
+            paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
+        said = [load_demonstrations(paths[task]).instruction for task in tasks]
+        features, identity = text_features(said, args.clip_weights, info["text_weights"])
+        text = dict(zip(tasks, features.to(device) * settings.instruction))  # each (text_dim,)
 
-    # Each task before, in between if asked for, and after
-    between = sorted({step for step in args.curve if 0 < step < settings.steps})
-    columns = {"before": checkpoint}
-    columns |= {f"{step} steps": f"adapted-{step:05d}.pt" for step in between}
-    columns["after"] = "adapted.pt"
-    results, seconds = {column: {} for column in columns}, 0.0
-    for task in tasks:
-        arguments = checkpoint, paths[task], text[task], folders[task], settings, between
-        took = adapt_checkpoint(*arguments)["seconds"]
-        seconds += took
-        print(
-            f"adapted to {task} in {took:.1f} s; wrote {folders[task] / 'adapted.pt'}", flush=True
-        )
-        if simulated and settings.episodes:
-            protocol = (settings.episodes, settings.seed, args.workers, device)
-            for column, policy in columns.items():
-                of_task = {task: paths[task]}, text, *protocol, settings.demonstrations
-                results[column] |= evaluate.evaluate(folders[task].resolve() / policy, *of_task)
-    if not results["after"]:
-        return  # own recordings have no simulator to be rolled out in
+        # Each task before, in between if asked for, and after
+        between = sorted({step for step in args.curve if 0 < step < settings.steps})
+        columns = {"before": checkpoint.resolve()}
+        columns |= {f"{step} steps": f"adapted-{step:05d}.pt" for step in between}
+        columns["after"] = "adapted.pt"
+        results, seconds = {column: {} for column in columns}, 0.0
+        for task, out in folders.items():
+            arguments = checkpoint, paths[task], text[task], out, settings, between
+            took = adapt_checkpoint(*arguments)["seconds"]
+            seconds += took
+            print(f"adapted to {task} in {took:.1f} s; wrote {out / 'adapted.pt'}", flush=True)
+            if simulated and settings.episodes:
+                protocol = (settings.episodes, settings.seed, args.workers, device)
+                for column, policy in columns.items():
+                    of_task = {task: paths[task]}, text, *protocol, settings.demonstrations
+                    results[column] |= evaluate.evaluate(out / policy, *of_task)
+        if not results["after"]:
+            return  # own recordings have no simulator to be rolled out in
 
-    facts = {"title": f"{name}: before and after {settings.steps} steps"}
-    facts |= {"checkpoint": str(checkpoint), "seconds a task": round(seconds / len(tasks), 1)}
-    kept = ("steps", "demonstrations", "episodes", "seed", "instruction")
-    facts |= {"text weights": identity} | {name: getattr(settings, name) for name in kept}
-    facts |= scripts.report_facts("finetune.py", argv, device)
-    print(f"\n{evaluate.write_report(folder, results, facts, info['suite'])}")
+        facts = {"title": f"{name}: before and after {settings.steps} steps"}
+        facts |= {"checkpoint": str(checkpoint), "seconds a task": round(seconds / len(tasks), 1)}
+        kept = ("steps", "demonstrations", "episodes", "seed", "instruction")
+        facts |= {"text weights": identity} | {key: getattr(settings, key) for key in kept}
+        facts |= scripts.report_facts("finetune.py", argv, device)
+        print(f"\n{evaluate.write_report(folder, results, facts, info['suite'])}")
 
 
 if __name__ == "__main__":

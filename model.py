@@ -75,6 +75,12 @@ class PolicyConfig:
         object.__setattr__(self, "pointnet_widths", tuple(self.pointnet_widths))
         object.__setattr__(self, "unet_widths", tuple(self.unet_widths))
 
+        if (
+            not self.pointnet_widths
+            or not self.unet_widths
+            or self.vmt_layers + self.u2t_layers > 99
+        ):
+            raise ValueError("each network needs a width, and VMT and U2T at most 99 layers")
         for name, value in vars(self).items():
             if isinstance(value, int) and not 1 <= value <= 100_000:
                 raise ValueError(f"{name} is {value}: use at least 1, at most 100000")
@@ -563,8 +569,9 @@ class DAMIPolicy(nn.Module):
             return None
         tokens = None
         if config.demo_encoder != "none":
-            T, most = demo_points.shape[1], config.demo_positions
-            if T > most:
+            demo = {"demo_points": demo_points, "demo_state": demo_state}
+            self.check_shapes(**demo, demo_action=demo_action)
+            if (T := demo_points.shape[1]) > (most := config.demo_positions):
                 raise ValueError(f"a demonstration has {T} frames, the policy {most} positions")
             features = self.encode_observations(demo_points, demo_state)  # (D, T, feature)
             actions = self.normalizer.normalize("action", demo_action)  # (D, T, A)
@@ -604,7 +611,8 @@ class DAMIPolicy(nn.Module):
             noise, timesteps: standard normal (B, H, A), and k in [0, K), (B,) int64.
             task: the arguments of `encode_demo`, of D tasks; D divides B.
         """
-        self.check_shapes(points, state, action=action, noise=noise, timesteps=timesteps)
+        chunks = {"action": action, "noise": noise, "timesteps": timesteps}
+        self.check_shapes(points=points, state=state, **chunks)
         context = self.encode_demo(**task)
         clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
         noisy = self.schedule.add_noise(clean, noise, timesteps)  # A_k, (B, H, A)
@@ -628,7 +636,7 @@ class DAMIPolicy(nn.Module):
         from the newest observation on, in the demonstrations' unit.
         """
         config = self.config
-        self.check_shapes(points, state)
+        self.check_shapes(points=points, state=state)
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
         shape = (len(points), config.horizon, config.action_dim)
         source = points.device if generator is None else generator.device
@@ -642,17 +650,20 @@ class DAMIPolicy(nn.Module):
         chunk = actions[:, newest : newest + config.n_action_steps]  # (B, Ta, A)
         return self.normalizer.unnormalize("action", chunk)
 
-    def check_shapes(self, points: Tensor, state: Tensor, **others: Tensor) -> None:
+    def check_shapes(self, **inputs: Tensor) -> None:
         """Raises ValueError for shapes that would broadcast to a wrong result without an error."""
-        config, B = self.config, len(points)
+        config, (B, T, *N, _) = self.config, next(iter(inputs.values())).shape  # of the clouds
         expected = {
-            "points": (B, config.n_obs_steps, *points.shape[2:3], 3),  # any number of points
+            "points": (B, config.n_obs_steps, *N, 3),  # any number of points
             "state": (B, config.n_obs_steps, config.state_dim),
             "action": (B, config.horizon, config.action_dim),
             "noise": (B, config.horizon, config.action_dim),
             "timesteps": (B,),
+            "demo_points": (B, T, *N, 3),
+            "demo_state": (B, T, config.state_dim),
+            "demo_action": (B, T, config.action_dim),
         }
-        for name, x in {"points": points, "state": state, **others}.items():
+        for name, x in inputs.items():
             if x.shape != expected[name]:
                 raise ValueError(f"{name} is {tuple(x.shape)}, the policy takes {expected[name]}")
 

@@ -186,8 +186,9 @@ def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **
         torch.save(content, temporary)
         os.replace(temporary, path)
     except RuntimeError as error:  # how torch.save reports a full disk
-        free = shutil.disk_usage(path.parent).free / 1e6
-        raise OSError(f"cannot write {path}: {free:.1f} MB are free there; make room") from error
+        free = shutil.disk_usage(path.parent).free / 1e6  # MB
+        advice = "make room" if free < 1000 else "look at its permissions and at `ulimit -f`"
+        raise OSError(f"cannot write {path}, {free:.0f} MB are free there: {advice}") from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -205,13 +206,14 @@ def load_checkpoint(
         raise ValueError(f"no checkpoint at {path}: name a .pt file, or train one with train.py")
     try:
         with zipfile.ZipFile(path) as archive:  # torch.load does not look at the check sums
-            damaged = archive.testzip()
+            odd = [entry.filename for entry in archive.infolist() if entry.external_attr]
+            damaged = archive.testzip() or next(iter(odd), None)  # attributes: a folder to torch
         info = None if damaged else torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # torch raises many types here; each means it cannot be read
         raise ValueError(f"{path} is damaged or no PyTorch checkpoint: use another file") from error
 
     if damaged:
-        raise ValueError(f"{path} is damaged (in {damaged}): use another file")
+        raise ValueError(f"{path} is damaged (in {damaged!r}): use another file")
     ours = isinstance(info, dict) and info.get("format") == CHECKPOINT_FORMAT
     missing = [name for name in needs if not ours or name not in info]
     if not ours or missing:
@@ -233,6 +235,7 @@ def digest(samplers: dict[str, WindowSampler]) -> str:
     """A fingerprint of everything that is trained on."""
     sha = hashlib.sha256()
     for sampler in samplers.values():
+        sha.update(f"{sampler.task} {sampler.instruction}".encode())
         for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
             sha.update(part.cpu().numpy().tobytes())
     return sha.hexdigest()
@@ -249,11 +252,14 @@ def restore(
     """Puts all three in the state of last.pt; returns the rest of it: step, seconds, text_weights.
 
     Raises ValueError if the run was started with other settings, or on other data (its digest).
+    Before the first inner step another --maml is no other setting.
     """
     device = policy.normalizer.action_scale.device
     averaged, left = load_checkpoint(path, device, needs=("training", "data"))
     old = left["arguments"] | asdict(averaged.config)
     new = asdict(settings) | asdict(policy.config)
+    if left["step"] <= old.get("multi_task_share", 0) * old["steps"]:
+        old["maml"] = new["maml"]
     changed = [f"{k} {old.get(k)} -> {new[k]}" for k in new if old.get(k) != new[k]]
     if changed:
         what = f"other settings ({', '.join(changed)})"
@@ -268,7 +274,6 @@ def restore(
 
 
 # ---- Folders of runs -----------------------------------------------------------------------------
-
 
 RESULTS = "adapted.pt", "adapted-*.pt", "success.json", "success.md", "success.png"
 OF_ADAPTING = "config.json", "metrics.jsonl"
@@ -303,11 +308,19 @@ def locked(folder: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ValueError(f"another process runs in {folder}: use another --out") from None
-        for temporary in folder.glob(".[0-9]*"):  # of `write_atomically` and `save_checkpoint`
-            temporary.unlink()
+        remove_temporaries(folder)
         yield
     finally:
         os.close(descriptor)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Removes what killed processes left of files they were writing."""
+    for temporary in folder.glob(".[0-9]*.*"):  # of `write_atomically` and `save_checkpoint`
+        try:
+            os.kill(int(temporary.name.split(".")[1]), 0)
+        except (ProcessLookupError, ValueError, OverflowError):
+            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -443,7 +456,8 @@ def run_jobs(
         return []
 
     context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
-    stop, finished = context.Event(), context.SimpleQueue()
+    with ignored_interrupts():  # Python's resource tracker, which starts here, inherits it
+        stop, finished = context.Event(), context.SimpleQueue()
     workers = min(workers or os.cpu_count() or 1, len(jobs))
     pool = ProcessPoolExecutor(workers, context, start_worker, (stop, finished, setup))
     try:

@@ -29,7 +29,7 @@ from metaworld import env_dict
 from metaworld.policies import ENV_POLICY_MAP
 
 from data import Demonstrations, farthest_point_sample, load_demonstrations, save_demonstrations
-from scripts import choose, command_line, run_jobs, worker
+from scripts import choose, command_line, remove_temporaries, run_jobs, worker
 
 # Some experts ask for more than 1; their actions are clipped below.
 warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
@@ -509,6 +509,7 @@ def collect(
 
     if missing and not os.access(folder, os.W_OK):
         raise ValueError(f"{folder} cannot be written to: use another --data")
+    remove_temporaries(Path(folder))
     jobs = [(task, paths[task], episodes, seed) for task in missing]
     run_jobs(collect_task, jobs, workers, len(missing) * episodes, "collecting")
     return paths

@@ -100,11 +100,11 @@ PER_WINDOW = ("points", "state", "action", "noise", "timesteps")  # of a batch; 
 def task_batch(
     policy: DAMIPolicy,
     sampler: WindowSampler,
-    undone: WindowSampler | None,
     text: Tensor,
     n: int,
     seed: tuple[int, ...],
     settings: Settings,
+    undone: WindowSampler | None = None,
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
@@ -197,7 +197,7 @@ def meta_train(
     for step in range(start, settings.steps):  # lines 2, 22
         # A generator: the inner loop below keeps the batches of `at_once` tasks in memory, not all.
         batches = (  # lines 3 to 6, 9
-            task_batch(policy, samplers[t], undone.get(t), text[t], n, (seed, step, i), settings)
+            task_batch(policy, samplers[t], text[t], n, (seed, step, i), settings, undone.get(t))
             for i, t in my_tasks
         )
 
@@ -256,7 +256,8 @@ def choose_config(
             config,
             state_dim=recordings[0].state.shape[1],
             action_dim=recordings[0].action.shape[1],
-            num_points=min(config.num_points, *(d.points.shape[1] for d in recordings)),
+            num_points=args.num_points
+            or min(config.num_points, *(d.points.shape[1] for d in recordings)),
             demo_positions=math.ceil(longest / config.demo_stride),
         )
     return config
@@ -421,11 +422,13 @@ def run(
             if stop.requested and step < settings.steps:
                 raise KeyboardInterrupt(f"saved after step {step}, add --resume to go on")
             if leader and milestone:
-                measure(step)
                 evaluate.draw_curves(folder)
+                measure(step)
             began = time.monotonic()
 
         successes = measure(settings.steps)
+    if leader:
+        evaluate.draw_curves(folder)
 
     if successes:
         title = f"{settings.suite}, base tasks, {settings.preset}, step {settings.steps}"

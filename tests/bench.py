@@ -20,7 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from clip import text_features
 from data import Demonstrations, WindowSampler, farthest_point_sample, load_demonstrations
 from evaluate import EPISODES_A_JOB, SHIPPED_CHECKPOINT, rollout
-from finetune import BATCH, adapt_policy
+from finetune import BATCH, LEARNING_RATES, adapt_policy
 from maml import adapt, meta_gradient
 from model import PRESETS, DAMIPolicy, PolicyConfig
 from scripts import hardware, load_checkpoint, pick_device
@@ -33,7 +33,7 @@ from simulator import (
     suite_tasks,
 )
 from tests.textbook import TextbookDP3, training_step
-from train import SETTINGS, multi_task_gradient, split, task_batch
+from train import SETTINGS, Settings, multi_task_gradient, split, task_batch
 
 DP3 = {"demo_encoder": "none", "tcfm": "none"}
 
@@ -131,7 +131,7 @@ class Bench:
     def batches(self, tasks: int) -> list[dict[str, torch.Tensor]]:
         n = self.settings.support + self.settings.query
         return [
-            task_batch(self.policy, self.sampler, self.text, n, (0, 0, task))
+            task_batch(self.policy, self.sampler, self.text, n, (0, 0, task), self.settings)
             for task in range(tasks)
         ]
 
@@ -157,14 +157,9 @@ class Bench:
 
     def adapt(self, steps: int) -> list[float]:
         """The time at the end of each step of finetune.py."""
-        times = []
-
-        def on_step(step: int, loss: float) -> None:
-            times.append(time.perf_counter())
-
-        batch = BATCH[self.preset]
-        adapt_policy(self.policy, self.sampler, self.text, steps, batch, on_step=on_step)
-        return times
+        how = steps, BATCH[self.preset], LEARNING_RATES
+        training = adapt_policy(self.policy, self.sampler, self.text, *how)
+        return [time.perf_counter() for _ in training]
 
     def textbook(self, steps: int) -> list[float]:
         """The same for a textbook's training of the same network on the same windows."""
@@ -248,7 +243,7 @@ def inner_step_table(folder: str, seeds: int = 5) -> None:
         for seed in range(seeds):
             n = trained["support"] + trained["query"]
             batches = [
-                task_batch(policy, sampler, feature, n, (seed, 0, index))
+                task_batch(policy, sampler, feature, n, (seed, 0, index), Settings())
                 for index, (sampler, feature) in enumerate(zip(samplers, text))
             ]
             pairs = [split(batch, trained["support"]) for batch in batches]

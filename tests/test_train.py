@@ -47,12 +47,13 @@ def test_every_setting_is_a_flag_and_is_kept(run):
 
 
 def test_the_learning_rate_warms_up_and_falls_to_zero_along_a_cosine():
-    rate = functools.partial(train.learning_rate, steps=1500, peak=1e-3, warmup=500)
+    settings = train.Settings(steps=1500, lr=1e-3, warmup=500)
+    rate = functools.partial(train.learning_rate, settings=settings)
     assert rate(0) == pytest.approx(1e-3 / 500)
     assert rate(499) == rate(500) == pytest.approx(1e-3)
     assert rate(1000) == pytest.approx(5e-4)
     assert 0 < rate(1499) < 1e-8 and rate(1500) == pytest.approx(0, abs=1e-12)
-    assert train.learning_rate(0, 10, 1.0, 0) == 1.0  # no warm-up
+    assert train.learning_rate(0, replace(settings, warmup=0)) == 1e-3
     assert np.all(np.diff([rate(step) for step in range(500, 1500)]) < 0)
 
 
@@ -60,7 +61,7 @@ def test_support_and_query_are_disjoint_and_share_the_demonstration(recorded):
     policy = model.DAMIPolicy(model.PRESETS["tiny"])
     demonstrations = data.load_demonstrations(recorded / "reach.npz")
     sampler = data.WindowSampler(demonstrations, policy.config)
-    batch = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, 1, 2))
+    batch = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, 1, 2), train.Settings())
     support, query = train.split(batch, 4)
     for name in batch:
         if name in train.PER_WINDOW:
@@ -68,8 +69,8 @@ def test_support_and_query_are_disjoint_and_share_the_demonstration(recorded):
             assert len(support[name]) == 4
         else:
             assert support[name] is query[name] and len(batch[name]) == 1
-    again = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, 1, 2))
-    other = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, 2, 2))
+    again = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, 1, 2), train.Settings())
+    other = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, 2, 2), train.Settings())
     assert same_bits(batch, again) and not torch.equal(batch["noise"], other["noise"])
     assert not torch.equal(batch["action"], other["action"])
 
@@ -81,11 +82,12 @@ def test_a_share_of_the_batches_sees_no_instruction_or_is_played_backwards(recor
 
     undone = data.WindowSampler(data.backwards(demonstrations), policy.config)
 
-    def batches(*shares):
-        text = torch.ones(512)
-        return [train.task_batch(policy, sampler, text, 4, (0, k, 0), *shares) for k in range(40)]
+    def batches(**shares):
+        how = torch.ones(512), 4
+        rest = train.Settings(**shares), undone
+        return [train.task_batch(policy, sampler, *how, (0, k, 0), *rest) for k in range(40)]
 
-    plain, dropped, back = batches(), batches(0.5), batches(0.0, undone, 0.25)
+    plain, dropped, back = batches(), batches(instruction_dropout=0.5), batches(backwards=0.25)
     silent = [bool((batch["text"] == 0).all()) for batch in dropped]
     assert 10 <= sum(silent) <= 30
     for one, other in zip(plain, dropped):
