@@ -371,7 +371,7 @@ class WindowSampler:
     def augment(
         self, scenes: dict[str, Tensor], generator: torch.Generator, prefix: str = ""
     ) -> dict[str, Tensor]:
-        """Puts each scene elsewhere.
+        """Moves each scene by an affine map of its own.
 
         Points and the positions in a state move together, and the displacement that an action
         begins with turns and stretches with them: the scene stays one of the same task.

@@ -96,7 +96,7 @@ def checkpoints_of(path: str | Path) -> list[Path]:
 def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
     """The last checkpoint of the newest finished run on `suite`; without any, the one that ships.
 
-    Runs of `tiny` do not count: they show that everything works and learn next to nothing.
+    Runs of `tiny` do not count: they show that everything works, and succeed nearly nowhere.
     """
     finished = []
     for config in Path(runs).glob("*/config.json"):

@@ -45,7 +45,8 @@ from simulator import INSTRUCTIONS, SUITES, collect, suite_tasks
 class Settings(Flags):
     """What a run is made of. Each field is a flag, and is kept in every checkpoint (`arguments`).
 
-    The defaults are the paper's: 3000 epochs of 18 outer steps, and its hyperparameter table.
+    The defaults are the paper's: 3000 epochs of 18 outer steps, and its hyperparameter table,
+    which leaves out the length of the warm-up (DP3's is taken).
     """
 
     suite: str = setting("ml10", "ml10 or ml45 (default: ml10, or own recordings in --data)")
@@ -114,9 +115,9 @@ def task_batch(
 
     Returns the keyword arguments of `policy.loss`. They follow from `seed` alone.
     """
-    first, second = np.random.SeedSequence(seed).generate_state(2, np.uint64)
-    generator = torch.Generator().manual_seed(int(first))
-    drop, turn = torch.rand(2, generator=torch.Generator().manual_seed(int(second)))
+    for_batch, for_shares = np.random.SeedSequence(seed).generate_state(2, np.uint64)
+    generator = torch.Generator().manual_seed(int(for_batch))
+    drop, turn = torch.rand(2, generator=torch.Generator().manual_seed(int(for_shares)))
     if undone is not None and turn < settings.backwards:
         sampler, text = undone, torch.zeros_like(text)
     elif drop < settings.instruction_dropout:

@@ -110,7 +110,7 @@ def test_a_config_that_contradicts_itself_is_refused_naming_both_values(changes,
     assert all(number in str(error.value) for number in numbers) and "\n" not in str(error.value)
 
 
-def test_the_paper_preset_has_the_papers_size_and_condition_width():
+def test_the_preset_paper_has_258_million_parameters_and_the_papers_condition_width():
     with torch.device("meta"):
         policy = DAMIPolicy(PRESETS["paper"])
     assert 255e6 < sum(p.numel() for p in policy.parameters()) < 260e6

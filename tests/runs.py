@@ -1,0 +1,126 @@
+"""The runs behind RESULTS.md, as a queue: train, measure, report; survives a kill.
+
+    python -m tests.runs --list              # what there is, and what is done
+    python -m tests.runs --only dami neither # two at a time, one thread each
+    python -m tests.runs                     # all of it
+
+A variant is a set of flags of train.py, a run is a variant and a seed. A run is trained, then
+measured: base tasks as they are, novel tasks along their adaptation, and what swapping the
+demonstration does. A job whose result exists is skipped, a training that was interrupted goes on.
+`python -m tests.results` takes what is finished into RESULTS.json.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from scripts import choose, command_line
+
+NO_DEMONSTRATION = "--demo-encoder none --instruction-dropout 0 --backwards 0"
+VARIANTS = {
+    "dami": "",
+    "no-inner-loop": "--maml off",
+    "no-demonstration": NO_DEMONSTRATION,
+    "neither": f"{NO_DEMONSTRATION} --maml off",
+    "first-order": "--maml first",
+    "no-dropout": "--instruction-dropout 0 --backwards 0",
+    "no-backwards": "--backwards 0",
+    "mlp": "--demo-encoder mlp",
+    "mid": "--tcfm mid",
+    "up": "--tcfm up",
+    "baseline": "--demo-encoder mlp --tcfm none",
+    "vmt": "--tcfm none",
+}
+VARIANTS |= {policy: f"--policy {policy} --maml off" for policy in ("dp3", "flow", "mamba", "freq")}
+VARIANTS |= {f"{policy}-maml": f"--policy {policy}" for policy in ("dp3", "flow", "mamba", "freq")}
+
+SEED = 1  # of the evaluation's goals: that of no training, and of no choice that was made
+EPISODES = 100
+REPORTS = {  # name -> command; {run} is the run's folder
+    "base": "evaluate.py --checkpoint {run}",
+    "novel": "finetune.py --task novel --checkpoint {run}",
+    "swap": "evaluate.py --checkpoint {run} --without instruction --swap demonstration",
+    "one-shot": "evaluate.py --checkpoint {run} --split novel --without instruction",
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command whose result is a file."""
+
+    command: str
+    done: Path
+    log: Path
+
+    def run(self) -> int:
+        """Runs it in a process with one thread; returns the exit code."""
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        with self.log.open("a") as log:
+            print(f"$ python {self.command}", file=log, flush=True)
+            words = [sys.executable, *self.command.split()]
+            return subprocess.run(words, env=environment, stdout=log, stderr=log).returncode
+
+
+def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list[Job]:
+    """Training first, then what measures it."""
+    run = Path(f"runs/{suite}-{variant}-seed{seed}")
+    flags = f"--suite {suite} --preset small --seed {seed} --episodes 0 --out {run}"
+    flags += f" --steps {steps} --clip-weights random {VARIANTS[variant]}"
+    resume = " --resume" if (run / "last.pt").exists() else ""
+    last = run / f"ema-{steps:05d}.pt"
+    listed = [Job(f"train.py {flags}{resume}", last, run.with_suffix(".log"))]
+    for name, command in REPORTS.items():
+        if variant != "dami" and name in ("swap", "one-shot"):
+            continue  # of interest only where a demonstration is read
+        out = Path(f"{run}-{name}")
+        measured = f"{command.format(run=run)} --seed {SEED} --episodes {episodes} --workers 1"
+        measured += f" --out {out} --overwrite"
+        listed.append(Job(measured, out / "success.json", run.with_suffix(".log")))
+    return listed
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description="Trains and measures what RESULTS.md shows.")
+    parser.add_argument("--only", nargs="+", default=list(VARIANTS), help="these variants")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of training")
+    parser.add_argument("--suite", default="ml10", help="ml10 or ml45")
+    parser.add_argument("--steps", type=int, default=10_000, help="of each training")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="a task")
+    parser.add_argument("--at-once", type=int, default=2, help="runs at a time")
+    parser.add_argument("--list", action="store_true", help="only say what is done")
+    args = parser.parse_args(argv)
+    chains = [
+        jobs(choose(variant, VARIANTS, "variant"), seed, args.suite, args.steps, args.episodes)
+        for seed in args.seeds
+        for variant in args.only
+    ]
+    stopped = threading.Event()
+
+    def work(chain: list[Job]) -> None:
+        for job in chain:
+            if job.done.exists() or stopped.is_set():
+                continue
+            code = job.run()
+            print(f"{'done' if code == 0 else f'exit code {code}'}: {job.command}", flush=True)
+            if code != 0:
+                return  # what comes after needs it
+
+    if args.list:
+        for job in (job for chain in chains for job in chain):
+            print(f"{'done' if job.done.exists() else '    '}  python {job.command}")
+        return
+    with ThreadPoolExecutor(args.at_once) as pool:
+        try:
+            list(pool.map(work, chains))
+        finally:
+            stopped.set()
+
+
+if __name__ == "__main__":
+    command_line(main)
