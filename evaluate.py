@@ -30,7 +30,7 @@ from torch import Tensor
 import scripts
 from clip import text_features
 from data import WindowSampler, load_demonstrations, write_atomically
-from model import DAMIPolicy
+from model import CHOICES, DAMIPolicy
 from scripts import command_line, load_checkpoint, run_jobs, worker, write_text
 from simulator import MetaWorldPointCloudEnv, check_task, collect, evaluation_seed, suite_tasks
 
@@ -209,9 +209,9 @@ def sample_chunks(
 loaded: dict[str, Any] = {}  # what a worker process keeps between jobs: policy and environments
 
 
-def load_policy(checkpoint: str, device: str) -> None:
+def load_policy(checkpoint: str, device: str, sampler: str | None = None) -> None:
     """Sets up a worker process."""
-    loaded.update(policy=load_checkpoint(checkpoint, device)[0], task=None)
+    loaded.update(policy=load_checkpoint(checkpoint, device, sampler=sampler)[0], task=None)
 
 
 def rollout_job(
@@ -253,6 +253,7 @@ def evaluate(
     device: str | torch.device = "cpu",
     n_demonstrations: int | None = None,
     blank: bool = False,
+    sampler: str | None = None,
 ) -> Successes:
     """Rolls a checkpoint out on Meta-World tasks in parallel processes.
 
@@ -266,6 +267,7 @@ def evaluate(
         device: where the policy runs.
         n_demonstrations: use only the first so many of each file; None: all.
         blank: the policy sees zeros in place of its demonstration.
+        sampler: of the diffusion, ddim or dp3; None: as it was trained with.
 
     Returns:
         task -> E booleans, in the order of the episodes. They do not depend on `workers`.
@@ -279,7 +281,7 @@ def evaluate(
         for task, path in demonstrations.items()
         for chunk in chunks
     ]
-    setup = (load_policy, str(checkpoint), str(device))
+    setup = (load_policy, str(checkpoint), str(device), sampler)
     found = run_jobs(
         rollout_job, jobs, workers, len(demonstrations) * episodes, "evaluating", setup
     )
@@ -484,6 +486,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     )
     parts = {"nargs": "+", "choices": ("demonstration", "instruction"), "default": []}
     add("--swap", **parts, help="measure also with these of another task")
+    add("--sampler", choices=CHOICES["sampler"], help="DDIM as published, or as DP3 runs it")
     add("--without", **parts, help="leave these out: zeros in their place")
     add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
@@ -538,7 +541,7 @@ def main(argv: list[str] | None = None) -> None:
     labels = {path: f"{path.resolve().parent.name}/{path.stem}" for run in runs for path in run}
     if len(set(labels.values())) < sum(map(len, runs)):
         raise ValueError("two checkpoints have the same folder and file name: rename one's folder")
-    policy, info = load_checkpoint(runs[0][-1], device, needs=TRAINED)
+    policy, info = load_checkpoint(runs[0][-1], device, needs=TRAINED, sampler=args.sampler)
 
     # Tasks, their demonstrations and instructions
     suite = args.suite or info["suite"]
@@ -566,6 +569,8 @@ def main(argv: list[str] | None = None) -> None:
     facts = {"title": " ".join(args.task or []) or f"{suite}, {args.split} tasks"}
     facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
     facts |= scripts.report_facts("evaluate.py", argv, device)
+    if args.sampler:
+        facts["sampler"] = args.sampler
     if args.without:
         facts["without"] = " and ".join(args.without)
         if "instruction" in args.without:
@@ -588,6 +593,7 @@ def measure(
     """Rolls out the checkpoints of all runs (path -> label), and reports."""
     blank = "demonstration" in args.without
     protocol = (args.episodes, args.seed, args.workers, device, args.demonstrations, blank)
+    protocol += (args.sampler,)
     results, swapped = {}, {}
     for checkpoint in labels:
         results[checkpoint] = evaluate(checkpoint, paths, text, *protocol)

@@ -9,7 +9,7 @@ r"""The policy: what it reads, how it turns that into actions, how it is kept.
                                                         \-> clean actions A_0
 
 VMT: visual-motor trajectory encoder. U2T: unpaired unified task encoder. TCFM: task-conditioned
-feature modulation. FiLM: feature-wise linear modulation. `python model.py` prints every size.
+feature modulation. FiLM: feature-wise linear modulation.
 The file reads from small blocks to `DAMIPolicy` and imports nothing of the project. Its last
 section, PyTorch's layers written out for speed, can be skipped.
 
@@ -24,7 +24,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -35,6 +35,7 @@ from torch.optim.swa_utils import AveragedModel
 
 
 CHOICES = {"demo_encoder": ("vmt", "mlp", "none"), "tcfm": ("down", "mid", "up", "none")}
+CHOICES |= {"policy": ("dami", "dp3", "flow", "mamba", "freq"), "sampler": ("ddim", "dp3")}
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class PolicyConfig:
     The defaults are the paper's; what it leaves out (PointNet, the U-Net's widths) is DP3's.
     """
 
+    policy: str = "dami"  # dami | dp3 | flow | mamba | freq, see baselines.py
     state_dim: int = 9  # S: end effector, right finger, left finger, metres
     action_dim: int = 4  # A: dx, dy, dz, gripper
     num_points: int = 512  # N
@@ -53,7 +55,7 @@ class PolicyConfig:
     pointnet_widths: tuple[int, ...] = (64, 128, 256)
     point_feature_dim: int = 64
     state_feature_dim: int = 64
-    demo_encoder: str = "vmt"  # vmt | mlp | none
+    demo_encoder: str = "vmt"  # vmt | mlp (baselines.py) | none
     demo_stride: int = 1  # the demonstration encoder reads every demo_stride-th frame
     demo_positions: int = 200  # learned positions: the longest demonstration, after the stride
     demo_dim: int = 128  # the table calls it "Action Dim"
@@ -69,6 +71,7 @@ class PolicyConfig:
     n_groups: int = 8
     diffusion_steps: int = 100  # K
     inference_steps: int = 10
+    sampler: str = "ddim"  # ddim | dp3, see DiffusionSchedule.step
 
     def __post_init__(self):
         # A checkpoint brings lists back where tuples went in.
@@ -88,6 +91,10 @@ class PolicyConfig:
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"{name} is {value!r}; use one of {', '.join(known)}")
 
+        if self.policy != "dami" and self.reads_task:
+            raise ValueError(f"{self.policy} reads no task: use demo_encoder none and tcfm none")
+        if self.policy in ("flow", "freq") and self.sampler != "ddim":
+            raise ValueError(f"{self.policy} has a sampler of its own: leave out {self.sampler}")
         H, To, Ta = self.horizon, self.n_obs_steps, self.n_action_steps
         if Ta > (most := H - To + 1):
             raise ValueError(f"n_action_steps {Ta}: horizon {H} has {most} after observation {To}")
@@ -244,20 +251,6 @@ class VisualMotorTrajectory(nn.Module):
         return x
 
 
-class DemonstrationMLP(nn.Module):
-    """The ablation of VMT: an MLP on every frame, averaged over time."""
-
-    def __init__(self, config: PolicyConfig):
-        super().__init__()
-        width = config.demo_dim
-        d_in = config.observation_feature_dim + config.action_dim
-        self.mlp = nn.Sequential(nn.Linear(d_in, width), nn.ReLU(), nn.Linear(width, width))
-
-    def forward(self, features: Tensor, actions: Tensor) -> Tensor:
-        """features (D, T, feature), actions (D, T, A) -> one token (D, 1, demo_dim)."""
-        return self.mlp(torch.cat([features, actions], dim=-1)).mean(dim=1, keepdim=True)
-
-
 class UnpairedUnifiedTask(nn.Module):
     """U2T: fuses demonstration, instruction and h_k, and is read at h_k's place (Eqs. 6 and 8).
 
@@ -321,26 +314,6 @@ class UnpairedUnifiedTask(nn.Module):
         x = x + attention.merge(fused)  # (D, G, C)
         x = x + block.mlp(block.norm2(x))
         return x.flatten(0, 1)  # (B, C)   Eq. 8
-
-
-class PooledTask(nn.Module):
-    """What stands in for U2T in the ablation's rows without TCFM, "Baseline" (mlp) and "+ VMT".
-
-    The paper does not say how a demonstration enters there. Here its tokens, averaged over time,
-    and the instruction go through one linear layer and are added to h_k, for every block.
-    """
-
-    def __init__(self, config: PolicyConfig):
-        super().__init__()
-        self.projection = nn.Linear(config.demo_dim + config.text_dim, config.condition_dim)
-
-    def encode_context(self, demo_tokens: Tensor, text: Tensor) -> tuple[Tensor, ...]:
-        """demo_tokens (D, T, demo_dim), text (D, text_dim) -> ((D, C),)."""
-        return (self.projection(torch.cat([demo_tokens.mean(dim=1), text], dim=-1)),)
-
-    def forward(self, h: Tensor, context: tuple[Tensor, ...]) -> Tensor:
-        """h_k (B, C) and the context of D = B / G tasks -> (B, C)."""
-        return h + context[0].repeat_interleave(len(h) // len(context[0]), dim=0)
 
 
 # ---- The denoiser --------------------------------------------------------------------------------
@@ -447,8 +420,9 @@ class DiffusionSchedule(nn.Module):
     Betas follow the squared-cosine schedule of improved DDPM, capped at 0.999.
     """
 
-    def __init__(self, diffusion_steps: int = 100, inference_steps: int = 10):
+    def __init__(self, diffusion_steps: int = 100, inference_steps: int = 10, sampler="ddim"):
         super().__init__()
+        self.sampler = sampler
         self.diffusion_steps, self.inference_steps = diffusion_steps, inference_steps
         t = torch.arange(diffusion_steps + 1, dtype=torch.float64) / diffusion_steps
         level = torch.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2  # the ideal cumulative product
@@ -471,12 +445,14 @@ class DiffusionSchedule(nn.Module):
 
         The noise that is put back is the one that leads from the prediction to `noisy`, before
         clipping, as in today's diffusers. DP3 pins diffusers 0.11.1, which puts back the predicted
-        sample itself: x' = sqrt(a') clip(x0) + sqrt(1 - a') x0.
+        sample itself (sampler `dp3`): x' = sqrt(a') clip(x0) + sqrt(1 - a') x0.
         """
         stride = self.diffusion_steps // self.inference_steps
         a = self.alphas_cumprod[k]
         a_next = self.alphas_cumprod[k - stride] if k >= stride else torch.ones_like(a)
         noise = (noisy - a.sqrt() * prediction) / (1 - a).sqrt()
+        if self.sampler == "dp3":
+            noise = prediction
         return a_next.sqrt() * prediction.clamp(-1, 1) + (1 - a_next).sqrt() * noise
 
 
@@ -523,20 +499,22 @@ Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None:
 class DAMIPolicy(nn.Module):
     """The policy: two observations, an instruction and a demonstration in; eight actions out."""
 
+    # What baselines.py exchanges
+    demo_encoders: ClassVar = {"vmt": VisualMotorTrajectory}
+    network = ConditionalUNet1d
+
     def __init__(self, config: PolicyConfig):
         super().__init__()
         self.config = config
         self.normalizer = Normalizer(config.state_dim, config.action_dim)
         self.observation_encoder = ObservationEncoder(config)
         if config.demo_encoder != "none":
-            encoder = {"vmt": VisualMotorTrajectory, "mlp": DemonstrationMLP}[config.demo_encoder]
-            self.demo_encoder = encoder(config)
+            self.demo_encoder = self.demo_encoders[config.demo_encoder](config)
         if config.tcfm != "none":
             self.u2t = UnpairedUnifiedTask(config)
-        elif config.demo_encoder != "none":
-            self.pooled_task = PooledTask(config)
-        self.unet = ConditionalUNet1d(config)
-        self.schedule = DiffusionSchedule(config.diffusion_steps, config.inference_steps)
+        self.unet = self.network(config)
+        steps = config.diffusion_steps, config.inference_steps
+        self.schedule = DiffusionSchedule(*steps, config.sampler)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The parameters by adaptation learning rate: `vision`, `diffusion`, `other` (VMT, U2T)."""
@@ -576,19 +554,14 @@ class DAMIPolicy(nn.Module):
             features = self.encode_observations(demo_points, demo_state)  # (D, T, feature)
             actions = self.normalizer.normalize("action", demo_action)  # (D, T, A)
             tokens = self.demo_encoder(features, actions)  # (D, T, demo_dim)
-        fusion = self.pooled_task if config.tcfm == "none" else self.u2t
-        return fusion.encode_context(tokens, text)
+        return self.u2t.encode_context(tokens, text)
 
     def denoise(
         self, noisy: Tensor, timesteps: Tensor, observation: Tensor, context: Context
     ) -> Tensor:
         """A_k (B, H, A), k (B,) int64, observation (B, To * feature) -> predicted A_0 (B, H, A)."""
         h = self.unet.condition(timesteps, observation)  # (B, C)
-        if context is None:
-            return self.unet(noisy, h)
-        if self.config.tcfm == "none":
-            return self.unet(noisy, self.pooled_task(h, context))
-        return self.unet(noisy, h, fused=self.u2t(h, context))
+        return self.unet(noisy, h, None if context is None else self.u2t(h, context))
 
     def loss(
         self,
@@ -794,19 +767,3 @@ class WinningPoints(torch.autograd.Function):
         else:
             most = int(won.sum(dim=-1).max())
         return won.argsort(dim=-1, descending=True, stable=True)[..., :most]
-
-
-# ---- Sizes ---------------------------------------------------------------------------------------
-
-
-def main() -> None:
-    """Prints the size of every module of each preset."""
-    for preset, config in PRESETS.items():
-        with torch.device("meta"):  # weights are neither drawn nor stored
-            policy = DAMIPolicy(config)
-        for name, module in [(preset, policy), *policy.named_children()]:
-            print(f"{name:<20} {sum(p.numel() for p in module.parameters()):>12,}")
-
-
-if __name__ == "__main__":
-    main()

@@ -37,6 +37,7 @@ import torch.distributed as dist
 from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
+from baselines import build_policy
 from data import WindowSampler, write_atomically
 from model import DAMIPolicy, PolicyConfig
 
@@ -194,12 +195,16 @@ def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **
 
 
 def load_checkpoint(
-    path: str | Path, device: str | torch.device = "cpu", needs: Sequence[str] = ()
+    path: str | Path,
+    device: str | torch.device = "cpu",
+    needs: Sequence[str] = (),
+    sampler: str | None = None,
 ) -> tuple[DAMIPolicy, dict[str, Any]]:
     """Rebuilds the policy of a checkpoint, in evaluation mode on `device`.
 
-    Returns (policy, info): info is everything else in the file. Raises ValueError for a file that
-    is missing, damaged, not one of ours, lacks a name in `needs`, or whose weights do not fit.
+    Returns (policy, info): info is everything else in the file. `sampler` takes the place of that
+    in the configuration. Raises ValueError for a file that is missing, damaged, not one of ours,
+    lacks a name in `needs`, or whose weights do not fit.
     """
     path = Path(path)
     if not path.is_file():
@@ -221,9 +226,10 @@ def load_checkpoint(
         raise ValueError(f"{path} is not a file of train.py or finetune.py{lacks}: use such a one")
     try:
         config, weights = PolicyConfig(**info.pop("config")), info.pop("model")
+        config = replace(config, sampler=sampler or config.sampler)
         with torch.device("meta"):  # no memory for a size that the file does not hold
-            DAMIPolicy(config).load_state_dict({k: x.to("meta") for k, x in weights.items()})
-        policy = DAMIPolicy(config).to(device)
+            build_policy(config).load_state_dict({k: x.to("meta") for k, x in weights.items()})
+        policy = build_policy(config).to(device)
         policy.load_state_dict(weights)
     except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:200]

@@ -3,7 +3,7 @@
     python train.py --suite ml10                        # collects demonstrations, trains, evaluates
     python train.py --suite ml10 --preset tiny          # the same in two minutes, to see it work
     python train.py --suite ml10 --resume               # goes on where an interrupted run stopped
-    python train.py --suite ml10 --maml off --demo-encoder none --tcfm none     # multi-task DP3
+    python train.py --suite ml10 --policy dp3 --maml off    # multi-task DP3; see baselines.py
     python train.py --data recordings                   # own tasks: every recording in a folder
     torchrun --nproc-per-node 4 train.py --suite ml10   # tasks shared among 4 processes
 
@@ -29,6 +29,7 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.optim.swa_utils import AveragedModel
 
+import baselines
 import evaluate
 import scripts
 from clip import text_features
@@ -93,6 +94,7 @@ OWN_FRAMES = 500  # the paper's positions on the real robot
 EVALUATION_SEED = 0  # of the goals; the same for every seed of training
 SAVE_SECONDS = 20  # between two savings of last.pt: what a killed run loses at most
 PER_WINDOW = ("points", "state", "action", "noise", "timesteps")  # of a batch; the rest: per task
+PER_WINDOW += ("times", "drop_path", "cutoffs", "mask")  # of baselines.py
 
 
 # ---- Algorithm 1 ---------------------------------------------------------------------------------
@@ -247,9 +249,9 @@ def choose_config(
     args: argparse.Namespace, preset: str, recordings: list[Demonstrations], own: bool
 ) -> PolicyConfig:
     """A preset's architecture with what was given, and with the dimensions of own recordings."""
-    changes = {name: getattr(args, name) for name in ("demo_encoder", "tcfm", "num_points")}
-    changes = {name: value for name, value in changes.items() if value is not None}
-    config = replace(PRESETS[preset], **changes)
+    names = ("demo_encoder", "tcfm", "num_points", "sampler")
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    config = replace(baselines.PRESETS[args.policy][preset], **given)
     if own:
         episodes = [d.episode(i) for d in recordings for i in range(len(d))]
         longest = max(OWN_FRAMES, *(e.stop - e.start for e in episodes))
@@ -272,7 +274,7 @@ def initialize(
 ) -> tuple[DAMIPolicy, AveragedModel, torch.optim.Optimizer]:
     """A fresh policy, normalized to all windows (line 1), its moving average, and AdamW."""
     torch.manual_seed(settings.seed)
-    policy = DAMIPolicy(config).to(device)
+    policy = baselines.build_policy(config).to(device)
     parts = ("points", "state", "action")
     seen = {part: torch.cat([getattr(s, part) for s in samplers.values()]) for part in parts}
     policy.normalizer.fit(**seen)
@@ -293,6 +295,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--resume", action="store_true", help="go on from the run's last.pt")
     scripts.add_common_flags(add)
     add = parser.add_argument_group("architecture (default: the preset's)").add_argument
+    add("--policy", choices=CHOICES["policy"], default="dami", help="see baselines.py")
+    add("--sampler", choices=CHOICES["sampler"], help="DDIM as published, or as DP3 runs it")
     add("--demo-encoder", choices=CHOICES["demo_encoder"], help="encoder of the demonstration")
     add("--tcfm", choices=CHOICES["tcfm"], help="the U-Net level that reads it")
     add("--num-points", type=int, help="points of each cloud that the policy reads")
@@ -307,18 +311,22 @@ def main(argv: list[str] | None = None) -> None:
     default = "paper" if device.type == "cuda" else "small"
     preset = choose(args.preset or default, PRESETS, "preset")
     suite = "own" if own else choose(args.suite or "ml10", SUITES, "suite")
-    settings = SETTINGS[preset].given(args, suite=suite)
+    settings = SETTINGS[preset]
+    if args.policy != "dami" or args.demo_encoder == "none":  # the instruction alone tells the task
+        settings = replace(settings, instruction_dropout=0.0, backwards=0.0)
+    settings = settings.given(args, suite=suite)
+    name = preset if args.policy == "dami" else f"{args.policy}-{preset}"
     if own:  # all demonstrations unless told otherwise, and no simulator to be rolled out in
         settings = replace(settings, demonstrations=args.demonstrations, episodes=0)
     tasks = list(own) or suite_tasks(suite)[0]
     paths = own or {task: Path(args.data or "data") / f"{task}.npz" for task in tasks}
-    folder = Path(args.out or f"runs/{suite}-{preset}-seed{settings.seed}")
+    folder = Path(args.out or f"runs/{suite}-{name}-seed{settings.seed}")
 
     device, rank, world = scripts.join_processes(device, len(tasks))
     with scripts.locked(folder) if rank == 0 else nullcontext():
         if rank == 0:
             where = f"{device} ({scripts.hardware(device)})"
-            print(f"preset {preset} on {where}, {len(tasks)} tasks, in {folder}", flush=True)
+            print(f"preset {name} on {where}, {len(tasks)} tasks, in {folder}", flush=True)
             if args.resume and not (folder / "last.pt").exists():
                 raise ValueError(f"there is no run to resume in {folder}: look at --out")
             if not args.resume and any(folder.glob("*.pt")):
@@ -432,7 +440,7 @@ def run(
         evaluate.draw_curves(folder)
 
     if successes:
-        title = f"{settings.suite}, base tasks, {settings.preset}, step {settings.steps}"
+        title = f"{settings.suite}, base tasks, {settings.preset}, {config.policy}"
         facts |= {"title": title, "episodes a task": settings.episodes, "seed": EVALUATION_SEED}
         facts |= {"training": f"{seconds / 60:.1f} min", "training seed": settings.seed}
         columns = {"last checkpoint": successes}

@@ -21,12 +21,11 @@ from pathlib import Path
 
 from scripts import choose, command_line
 
-NO_DEMONSTRATION = "--demo-encoder none --instruction-dropout 0 --backwards 0"
 VARIANTS = {
     "dami": "",
     "no-inner-loop": "--maml off",
-    "no-demonstration": NO_DEMONSTRATION,
-    "neither": f"{NO_DEMONSTRATION} --maml off",
+    "no-demonstration": "--demo-encoder none",
+    "neither": "--demo-encoder none --maml off",
     "first-order": "--maml first",
     "no-dropout": "--instruction-dropout 0 --backwards 0",
     "no-backwards": "--backwards 0",

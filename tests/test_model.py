@@ -2,7 +2,6 @@
 
 import ast
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from diffusers.models.embeddings import get_timestep_embedding
 import data
 import model
 import scripts
+from baselines import build_policy
 from model import (
     PRESETS,
     Conv1d,
@@ -55,7 +55,7 @@ def imports(path):
 
 def new_policy(seed=0, **changes):
     torch.manual_seed(seed)
-    return DAMIPolicy(replace(TINY, **changes)).eval()
+    return build_policy(replace(TINY, **changes)).eval()
 
 
 def random_batch(config, windows=6, tasks=1, frames=10, seed=0):
@@ -602,19 +602,6 @@ def test_a_failing_save_leaves_the_old_checkpoint_and_no_temporary_file(
         scripts.save_checkpoint(tmp_path / "a.pt", new_policy(seed=1), step=2)
     assert scripts.load_checkpoint(tmp_path / "a.pt")[1]["step"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
-
-
-# ---- python model.py -----------------------------------------------------------------------------
-
-
-def test_the_printed_table_counts_every_preset(monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["model.py"])
-    model.main()
-    printed = capsys.readouterr().out
-    for name, config in PRESETS.items():
-        with torch.device("meta"):
-            count = sum(p.numel() for p in DAMIPolicy(config).parameters())
-        assert re.search(rf"^{name} +{count:,}$", printed, re.M)
 
 
 # ---- Reading the demonstration -------------------------------------------------------------------
