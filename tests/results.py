@@ -1,18 +1,17 @@
-"""RESULTS.json, and what README and RESULTS.md show of it: tables, a learning curve, a chart.
+"""RESULTS.json, and what README and RESULTS.md show of it: tables and charts.
 
-    python -m tests.results runs/seeds         # takes a report of evaluate.py into RESULTS.json
-    python -m tests.results                    # writes the tables, draws the pictures
-    python -m tests.results --ship CHECKPOINT  # makes it assets/ml10-small.pt, weights as float16
+    python -m tests.results runs/ml10-dami-seed0   # takes a run of tests.runs into RESULTS.json
+    python -m tests.results                        # writes the tables, draws the charts
+    python -m tests.results --ship CHECKPOINT      # makes it assets/ml10-small.pt, float16
 
-RESULTS.json keeps for each report every episode (1: success, 0: not), the command that measured it,
-hardware, seed and date; and for each training run that a report names its settings, command and
-time.
+RESULTS.json holds for each run how it was trained and, for each report that measured it, every
+episode (1: success, 0: not) with the command, hardware, seed and date.
 """
 
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,246 +24,225 @@ from evaluate import (
     format_success,
     mean_interval,
     mean_success,
-    paper_success,
+    wilson_interval,
 )
 from scripts import load_checkpoint, save_checkpoint
 from simulator import suite_tasks
+from tests.runs import REPORTS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "RESULTS.json"
+PAPER = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
 BASE, NOVEL = suite_tasks("ml10")
-SEEDS = ["seeds", "seed2"]  # the reports that hold the three seeds
-CHECKPOINTS = ["top5-0", "top5-1", "top5-2"]  # those of every checkpoint of each seed
-BASE_COLUMNS = {"small, 3 seeds": SEEDS, "the one in `assets/`": ["shipped"]}
-NOVEL_COLUMNS = {
-    "small, 3 seeds": SEEDS,
-    "with 1000 steps": ["long-0", "long-1", "long-2"],
-    "the one in `assets/`": ["shipped"],
+TASKS = {"base": BASE, "novel": NOVEL}
+VARIANTS = {  # a run's name without its seed -> what it is
+    "ml10-dami": "DAMI",
+    "ml10-no-inner-loop": "without the inner loop",
+    "ml10-no-demonstration": "without a demonstration",
+    "ml10-neither": "without both: multi-task training",
+    "before": "before: the instruction always told, inner rate 1e-4",
+    "before-no-inner-loop": "before, without the inner loop",
 }
-ABLATIONS = [  # what is different in it, reports
-    ("DAMI", SEEDS),
-    (
-        "no MAML at all (`--maml off`)",
-        ["eval-multi-task", "eval-multi-task-seed1", "eval-multi-task-seed2"],
-    ),
-    ("DAMI", ["eval-short-dami"]),
-    ("an inner rate 30 times as large (`--inner-lr 3e-3`)", ["eval-short-inner"]),
-    ("first order instead of second (`--maml first`)", ["eval-short-first-order"]),
-    ("an MLP instead of VMT (`--demo-encoder mlp`)", ["eval-short-mlp"]),
-    ("TCFM in the middle of the U-Net (`--tcfm mid`)", ["eval-short-mid"]),
-    ("TCFM in the last up-sampling level (`--tcfm up`)", ["eval-short-up"]),
-    ("DP3 + MAML (`--demo-encoder none --tcfm none`)", ["eval-short-dp3-maml"]),
-    ("multi-task DP3 (the same with `--maml off`)", ["eval-short-dp3"]),
-]
 
 
-def take(results: dict, folder: Path) -> None:
-    """Adds the report in a folder of evaluate.py, and the training runs beside it, to `results`."""
-    report = json.loads((folder / "success.json").read_text())
-    for kind in ("successes", "checkpoints"):
-        for label, successes in report.get(kind, {}).items():
-            report[kind][label] = {
-                task: "".join(str(int(s)) for s in episodes) for task, episodes in successes.items()
+def take(results: dict, run: Path) -> None:
+    """Adds a run's training and the reports beside its folder to `results`."""
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    minutes = [line["seconds"] for line in lines if "loss" in line][-1] / 60
+    config = json.loads((run / "config.json").read_text())
+    results[run.name] = {"training": {"minutes": round(minutes, 1), **config}}
+    for name in REPORTS:
+        path = Path(f"{run}-{name}") / "success.json"
+        if path.exists():
+            report = json.loads(path.read_text())
+            report["successes"] = {
+                column: {task: "".join(str(int(s)) for s in e) for task, e in tasks.items()}
+                for column, tasks in report["successes"].items()
             }
-    results["evaluations"][folder.name] = report
-    for run in {label.split("/")[0] for label in report["successes"]} - {"assets"}:
-        path = folder.parent / run
-        lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
-        minutes = [line["seconds"] for line in lines if "loss" in line][-1] / 60
-        results["trainings"][run] = {
-            "minutes": round(minutes, 1),
-            **json.loads((path / "config.json").read_text()),
-        }
+            results[run.name][name] = report
 
 
-def successes(
-    results: dict, reports: Sequence[str], kind: str = "successes"
-) -> dict[str, Successes]:
-    """Label -> task -> episodes of reports: of the last checkpoints, or of all (kind
-    `checkpoints`).
-    """
-    return {
-        label: {task: [c == "1" for c in episodes] for task, episodes in tasks.items()}
-        for report in reports
-        for label, tasks in results["evaluations"][report][kind].items()
-    }
+def runs_of(results: dict, variant: str) -> list[dict]:
+    """The runs of a variant, one a seed."""
+    return [run for name, run in sorted(results.items()) if name.rsplit("-seed")[0] == variant]
 
 
-def curves(results: dict, reports: Sequence[str], tasks: list[str]) -> dict[str, dict[int, float]]:
-    """Run -> step -> mean success over tasks, for each of its checkpoints."""
-    found: dict[str, dict[int, float]] = {}
-    for label, measured in successes(results, reports, "checkpoints").items():
-        run, checkpoint = label.split("/")
-        found.setdefault(run, {})[int(checkpoint.removeprefix("ema-"))] = mean_success(
-            only(measured, tasks)
-        )
-    return found
+def measured(run: dict, report: str, column: int | str = 0) -> Successes | None:
+    """The episodes in a column (its name, or its place) of a run's report, if there is one."""
+    columns = run.get(report, {}).get("successes", {})
+    if isinstance(column, int):
+        column = list(columns)[column] if columns else ""
+    if column not in columns:
+        return None
+    return {task: [c == "1" for c in episodes] for task, episodes in columns[column].items()}
 
 
-def only(results: Successes, tasks: list[str]) -> Successes:
-    return {task: results[task] for task in tasks}
+def mean(results: dict, variant: str, report: str, column: int | str = 0) -> str:
+    """The mean over tasks: Student's interval over several seeds, Wilson's over one's episodes."""
+    found = [measured(run, report, column) for run in runs_of(results, variant)]
+    found = [successes for successes in found if successes]
+    if not found:
+        return ""
+    if len(found) > 1:
+        return mean_interval([mean_success(successes) for successes in found])
+    episodes = [s for task in found[0].values() for s in task]
+    return f"{format_success(sum(episodes), len(episodes))} (one run)"
 
 
-def pooled(results: Successes, tasks: list[str]) -> str:
-    """The episodes of several tasks together, with Wilson's interval."""
-    episodes = [success for task in tasks for success in results[task]]
-    return format_success(sum(episodes), len(episodes))
+def row(*cells: object) -> str:
+    return f"| {' | '.join(str(cell) for cell in cells)} |"
 
 
-def mean_of_runs(runs: list[Successes], tasks: list[str]) -> str:
-    """Student's interval over several runs; Wilson's over the episodes of one."""
-    if len(runs) == 1:
-        return pooled(runs[0], tasks)
-    return mean_interval([mean_success(only(run, tasks)) for run in runs])
-
-
-def seeds_table(
-    results: dict, tasks: list[str], columns: dict[str, list[str]], checkpoints: Sequence[str] = ()
-) -> str:
-    """A row a task: the seeds' episodes together, a column for some reports; then the means over
-    seeds.
-
-    With the reports of every checkpoint also the paper's number: the mean of the five best
-    checkpoints of each run.
-    """
-    lines = [
-        f"| task | {' | '.join(columns)} | paper, DP3 | paper, DAMI |",
-        "|---" * (len(columns) + 3) + "|",
-    ]
-    runs = {title: list(successes(results, reports).values()) for title, reports in columns.items()}
-    paper = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
-    dp3 = {task: (paper["base"] | paper["novel"])[task]["DP3"] for task in tasks}
-    for task in tasks:
-        cells = [
-            pooled({task: [s for run in seeds for s in run[task]]}, [task])
-            for seeds in runs.values()
-        ]
-        lines.append(
-            f"| {task} | {' | '.join(cells)} | {dp3[task]:.1f} | {paper_success('ml10', task):.1f} "
-            "|"
-        )
-    means = [mean_of_runs(seeds, tasks) for seeds in runs.values()]
-    ours = np.mean([paper_success("ml10", task) for task in tasks])
-    of_paper = f"{np.mean(list(dp3.values())):.1f} | {ours:.1f} |"
-    lines.append(f"| **mean** | {' | '.join(means)} | {of_paper}")
-    if checkpoints:
-        best = [
-            float(np.mean(sorted(curve.values())[-5:]))
-            for curve in curves(results, checkpoints, tasks).values()
-        ]
-        lines.append(
-            f"| mean, best 5 checkpoints | {mean_interval(best)}{' |' * len(columns)} {of_paper}"
-        )
-    return "\n".join(lines)
-
-
-def ablation_table(results: dict) -> str:
-    """A row a variant: what is different in it, and its means over the base and over the novel
-    tasks.
-    """
-    lines = ["| outer steps | variant | base | novel |", "|---|---|---|---|"]
-    for title, reports in ABLATIONS:
-        measured = successes(results, reports)
-        (steps,) = {
-            results["trainings"][label.split("/")[0]]["arguments"]["steps"] for label in measured
-        }
-        cells = [mean_of_runs(list(measured.values()), tasks) for tasks in (BASE, NOVEL)]
-        lines.append(f"| {steps} | {title} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+def table(head: list[str], rows: list[list[object]]) -> str:
+    return "\n".join([row(*head), "|---" * len(head) + "|", *(row(*cells) for cells in rows)])
 
 
 def means_table(results: dict) -> str:
-    """The two means, ours and the paper's."""
-    paper = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
-    rows = {
-        "base tasks": (BASE, SEEDS, "base"),
-        "novel tasks": (NOVEL, SEEDS, "novel"),
-        "novel tasks, 1000 steps": (NOVEL, NOVEL_COLUMNS["with 1000 steps"], "novel"),
+    """The means of DAMI and of multi-task training, the paper's beside them."""
+    shown = {
+        "base tasks": ("base", 0, "base"),
+        "novel tasks, no gradient step": ("novel", "before", ""),
+        "novel tasks, 200 steps": ("novel", "after", "novel"),
     }
-    lines = ["| ML10 | `small` | paper, DP3 | paper, DAMI |", "|---|---|---|---|"]
-    for title, (tasks, reports, split) in rows.items():
-        ours = mean_of_runs(list(successes(results, reports).values()), tasks)
-        theirs = [np.mean([paper[split][task][row] for task in tasks]) for row in ("DP3", "DAMI")]
-        lines.append(f"| {title} | {ours} | {theirs[0]:.1f} | {theirs[1]:.1f} |")
-    return "\n".join(lines)
+    rows = []
+    for title, (report, column, split) in shown.items():
+        theirs = [
+            f"{np.mean([PAPER[split][task][name] for task in TASKS[split]]):.1f}" if split else ""
+            for name in ("DP3", "DAMI")
+        ]
+        ours = [mean(results, v, report, column) for v in ("ml10-dami", "ml10-neither")]
+        rows.append([title, *ours, *theirs])
+    return table(
+        ["ML10", "DAMI", "multi-task, no demonstration", "paper, DP3", "paper, DAMI"], rows
+    )
+
+
+def by_task_table(split: str) -> Callable[[dict], str]:
+    """A row a task: DAMI's seeds together, and the paper's."""
+    columns = (
+        {"DAMI": 0} if split == "base" else {"no gradient step": "before", "200 steps": "after"}
+    )
+
+    def make(results: dict) -> str:
+        rows = []
+        for task in TASKS[split]:
+            cells = []
+            for column in columns.values():
+                found = [measured(run, split, column) for run in runs_of(results, "ml10-dami")]
+                episodes = [s for successes in found if successes for s in successes[task]]
+                cells.append(format_success(sum(episodes), len(episodes)) if episodes else "")
+            theirs = [f"{PAPER[split][task][name]:.1f}" for name in ("DP3", "DAMI")]
+            rows.append([task, *cells, *theirs])
+        means = [mean(results, "ml10-dami", split, column) for column in columns.values()]
+        theirs = [np.mean([PAPER[split][t][n] for t in TASKS[split]]) for n in ("DP3", "DAMI")]
+        rows.append(["**mean**", *means, *(f"{value:.1f}" for value in theirs)])
+        return table(["task", *columns, "paper, DP3", "paper, DAMI"], rows)
+
+    return make
+
+
+def variants_table(results: dict) -> str:
+    """What decides: a row a variant."""
+    rows = []
+    for variant, title in VARIANTS.items():
+        columns = ("base", 0), ("novel", "before"), ("novel", "after")
+        if runs_of(results, variant):
+            rows.append([title, *(mean(results, variant, *column) for column in columns)])
+    return table(["ML10", "base", "novel, no gradient step", "novel, 200 steps"], rows)
+
+
+def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
+    """Policy -> what it is shown, and its episodes on the base tasks."""
+    found = {}
+    for variant, title in (("before", "before"), ("ml10-dami", "DAMI")):
+        for run in runs_of(results, variant)[:1]:
+            shown = [
+                ("instruction, own demonstration", measured(run, "told", 0)),
+                ("instruction, another's demonstration", measured(run, "told", 1)),
+                ("another's instruction, own demonstration", measured(run, "told", 2)),
+                ("own demonstration alone", measured(run, "swap", 0)),
+                ("another's demonstration alone", measured(run, "swap", 1)),
+            ]
+            found[title] = [(label, successes) for label, successes in shown if successes]
+    return found
+
+
+def swap_table(results: dict) -> str:
+    rows = {}
+    policies = swaps(results)
+    for title, shown in policies.items():
+        for label, successes in shown:
+            episodes = [s for task in successes.values() for s in task]
+            rows.setdefault(label, {})[title] = format_success(sum(episodes), len(episodes))
+    cells = [[label, *(by.get(title, "") for title in policies)] for label, by in rows.items()]
+    return table(["what the policy sees", *policies], cells)
 
 
 TABLES = {
     "means": means_table,
-    "base": lambda results: seeds_table(results, BASE, BASE_COLUMNS, CHECKPOINTS),
-    "novel": lambda results: seeds_table(results, NOVEL, NOVEL_COLUMNS),
-    "ablations": ablation_table,
+    "base": by_task_table("base"),
+    "novel": by_task_table("novel"),
+    "variants": variants_table,
+    "swap": swap_table,
 }
 
 
 def fill(text: str, results: dict) -> str:
     """README or RESULTS.md with each table between its two comments as RESULTS.json has it."""
-    for name, table in TABLES.items():
+    for name, make in TABLES.items():
         pattern = rf"(<!-- results: {name} -->\n).*?(<!-- end -->)"
         if found := re.search(pattern, text, flags=re.S):
-            text = text.replace(found[0], f"{found[1]}{table(results)}\n{found[2]}")
+            text = text.replace(found[0], f"{found[1]}{make(results)}\n{found[2]}")
     return text
 
 
-def draw(results: dict) -> None:
-    """assets/learning-curve.png and assets/success.png."""
-    import matplotlib
+def draw_swap(results: dict, path: Path) -> None:
+    """A bar for each thing that a policy can be shown: is the demonstration read?"""
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    policies = {title: shown for title, shown in swaps(results).items() if shown}
+    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    for axes, (title, shown) in zip(
+        np.atleast_1d(figure.subplots(1, len(policies))), policies.items()
+    ):
+        for place, (label, successes) in enumerate(reversed(shown)):
+            episodes = [s for task in successes.values() for s in task]
+            rate, bounds = np.mean(episodes), wilson_interval(sum(episodes), len(episodes))
+            error = 100 * np.abs(np.array(bounds)[:, None] - rate)
+            color = "C3" if "another" in label else "C0"
+            axes.barh(place, 100 * rate, xerr=error, color=color, capsize=2)
+        axes.set_yticks(range(len(shown)), [label for label, _ in reversed(shown)], fontsize=8)
+        axes.set(xlabel="success on base tasks, %", xlim=(0, 100), title=title)
+        axes.spines[["top", "right"]].set_visible(False)
+    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
 
-    figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
-    for run, curve in curves(results, CHECKPOINTS, BASE).items():
-        arguments = results["trainings"][run]["arguments"]
-        axes.plot(
-            *zip(*sorted(curve.items())),
-            "o-",
-            markersize=3,
-            linewidth=1,
-            label=f"seed {arguments['seed']}",
-        )
-    axes.axvline(
-        arguments["steps"] * arguments["multi_task_share"],
-        color="0.7",
-        linestyle=":",
-        label="MAML begins",
-    )
-    axes.set(xlabel="outer step", ylabel="mean success on base tasks, %", ylim=(0, 100))
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)
-    write_atomically(
-        ROOT / "assets" / "learning-curve.png",
-        lambda path: figure.savefig(path, dpi=110, format="png"),
-    )
-    plt.close(figure)
 
-    figure, axes = plt.subplots(figsize=(9, 3.4), layout="constrained")
-    tasks = BASE + NOVEL
-    runs = list(successes(results, SEEDS).values())
+def draw_success(results: dict, path: Path) -> None:
+    """Success by task, base and novel, DAMI's seeds and the paper's."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    axes, runs = figure.subplots(), runs_of(results, "ml10-dami")
+    x = np.arange(15) + 0.5 * (np.arange(15) >= len(BASE))
     rates = np.array(
-        [[100 * np.mean(run[task]) for task in tasks] for run in runs]
+        [
+            [
+                100 * np.mean((measured(run, "base", 0) | measured(run, "novel", "after"))[task])
+                for task in BASE + NOVEL
+            ]
+            for run in runs
+        ]
     )  # (seeds, tasks)
-    x = np.arange(len(tasks)) + 0.5 * (np.arange(len(tasks)) >= len(BASE))
-    axes.bar(x - 0.2, rates.mean(0), 0.4, color="C0", label=f"small, mean of {len(runs)} seeds")
-    axes.plot(
-        np.tile(x - 0.2, len(runs)), rates.ravel(), ".", color="k", markersize=4, label="each seed"
-    )
-    axes.bar(
-        x + 0.2,
-        [paper_success("ml10", task) for task in tasks],
-        0.4,
-        color="0.75",
-        label="paper (on a GPU)",
-    )
-    axes.set_xticks(x, tasks, rotation=35, ha="right")
+    theirs = [(PAPER["base"] | PAPER["novel"])[task]["DAMI"] for task in BASE + NOVEL]
+    axes.bar(x - 0.2, rates.mean(0), 0.4, label=f"small, {len(runs)} seed(s)")
+    axes.plot(np.tile(x - 0.2, len(runs)), rates.ravel(), "k.", markersize=4, label="each seed")
+    axes.bar(x + 0.2, theirs, 0.4, color="0.75", label="paper (on a GPU)")
+    axes.set_xticks(x, BASE + NOVEL, rotation=35, ha="right")
     axes.set(ylabel="success, %", ylim=(0, 105))
     axes.set_title("base tasks directly, novel tasks (right) after 200 steps", fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(frameon=False, ncols=3, loc="outside upper center", fontsize=8)
-    write_atomically(
-        ROOT / "assets" / "success.png", lambda path: figure.savefig(path, dpi=110, format="png")
-    )
-    plt.close(figure)
+    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
 
 
 def ship(checkpoint: str) -> None:
@@ -274,21 +252,21 @@ def ship(checkpoint: str) -> None:
     save_checkpoint(SHIPPED_CHECKPOINT, policy, half=True, **kept)
 
 
-def main(folders: list[str]) -> None:
-    if folders[:1] == ["--ship"]:
-        return ship(folders[1])
-    empty = {"trainings": {}, "evaluations": {}}
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else empty
-    for folder in folders:
+def main(words: list[str]) -> None:
+    if words[:1] == ["--ship"]:
+        return ship(words[1])
+    results = json.loads(RESULTS.read_text())
+    for folder in words:
         take(results, Path(folder))
-    if folders:
+    if words:
         text = json.dumps(results, indent=1) + "\n"
         write_atomically(RESULTS, lambda path: path.write_text(text))
         return
     for name in ("README.md", "RESULTS.md"):
         filled = fill((ROOT / name).read_text(), results)
         write_atomically(ROOT / name, lambda path, filled=filled: path.write_text(filled))
-    draw(results)
+    draw_swap(results, ROOT / "assets" / "swap.png")
+    draw_success(results, ROOT / "assets" / "success.png")
 
 
 if __name__ == "__main__":

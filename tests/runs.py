@@ -43,6 +43,7 @@ EPISODES = 100
 REPORTS = {  # name -> command; {run} is the run's folder
     "base": "evaluate.py --checkpoint {run}",
     "novel": "finetune.py --task novel --checkpoint {run}",
+    "told": "evaluate.py --checkpoint {run} --swap demonstration instruction",
     "swap": "evaluate.py --checkpoint {run} --without instruction --swap demonstration",
     "one-shot": "evaluate.py --checkpoint {run} --split novel --without instruction",
 }
@@ -75,7 +76,7 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
     last = run / f"ema-{steps:05d}.pt"
     listed = [Job(f"train.py {flags}{resume}", last, run.with_suffix(".log"))]
     for name, command in REPORTS.items():
-        if variant != "dami" and name in ("swap", "one-shot"):
+        if variant != "dami" and name in ("told", "swap", "one-shot"):
             continue  # of interest only where a demonstration is read
         out = Path(f"{run}-{name}")
         measured = f"{command.format(run=run)} --seed {SEED} --episodes {episodes} --workers 1"
