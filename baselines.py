@@ -85,11 +85,12 @@ class FlowPolicy(DAMIPolicy):
 
     As t comes to s, f_t comes to x_s whatever v is: that alone ties the network to the data.
 
-    Left open: the publication takes f_r from averaged weights; its code takes it from the same ones
-    and lets the gradient pass through both. So does this: a target held fixed would leave the loss
-    without the derivative that MAML differentiates. The division is ours: without it the loss is
-    1e-4 of the others', which AdamW hardly feels, and an inner step moves nothing. The code's
-    horizon is 4, of which it executes 3: those from the newest of two observations on.
+    Left open: consistency flow matching takes f_r from averaged weights; FlowPolicy's code takes it
+    from the same ones and lets the gradient pass through both. So does this: a target held fixed
+    would leave the loss without the derivative that MAML differentiates. The division is ours:
+    without it the loss is 1e-4 of the others', which AdamW hardly feels, and an inner step moves
+    nothing. The code's horizon is 4, of which it executes 3: those from the newest of two
+    observations on.
     """
 
     START, STEP, SEGMENTS, WEIGHT = 0.01, 0.01, 2, 1e-5  # t >= START, r = t + STEP
@@ -606,6 +607,10 @@ POLICIES |= {"flow": FlowPolicy, "mamba": MambaPolicy, "freq": FreqPolicy}
 
 def build_policy(config: PolicyConfig) -> DAMIPolicy:
     """The policy that a configuration describes, with fresh weights."""
+    if config.policy != "dami" and config.reads_task:
+        raise ValueError(f"{config.policy} reads no task: use demo_encoder none and tcfm none")
+    if config.policy in ("flow", "freq") and config.sampler != "ddim":
+        raise ValueError(f"{config.policy} has a sampler of its own: leave out {config.sampler}")
     whole = config.demo_encoder != "mlp" and (config.tcfm != "none" or not config.reads_task)
     return (POLICIES[config.policy] if whole else AblatedPolicy)(config)
 

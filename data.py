@@ -10,12 +10,10 @@ Letters: W windows, T demonstration frames, F stored frames, N points, E episode
 To = 2 observation steps, Ta = 8 executed actions, A action dim, S state dim, M points to sample.
 """
 
-import argparse
 import json
 import math
 import os
 import re
-import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -84,16 +82,13 @@ class Demonstrations:
         """What keeps these arrays from being trained on; None if nothing does."""
         arrays = {part: getattr(self, part) for part in ("points", "state", "action")}
         for part, array in arrays.items():
-            dims = 3 if part == "points" else 2
-            floats = array.ndim == dims and np.issubdtype(array.dtype, np.floating)
-            if not floats or 0 in array.shape[1:] or not array.dtype.isnative:
-                return f"{part} must be {dims}-dimensional floats, not {array.dtype} {array.shape}"
+            dims, kind = 3 if part == "points" else 2, array.dtype
+            if array.ndim != dims or kind.kind != "f" or not kind.isnative or 0 in array.shape[1:]:
+                return f"{part} must be {dims}-dimensional floats, not {kind} {array.shape}"
         if self.points.shape[2] != 3:
             return f"points must be (frames, points, 3), not {self.points.shape}"
-
         ends = self.episode_ends
-        whole = ends.ndim == 1 and np.issubdtype(ends.dtype, np.integer)
-        if not whole or (np.diff(ends, prepend=0) <= 0).any():
+        if ends.ndim != 1 or ends.dtype.kind not in "iu" or (np.diff(ends, prepend=0) <= 0).any():
             return "episode_ends must be growing whole numbers, one past each episode's last frame"
         if len(ends) == 0:
             return "holds no episodes: record or collect it again"
@@ -190,13 +185,11 @@ STRETCH = 0.1  # share of shear and stretch, at most
 def draw_affine_maps(n: int, middle: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Draws n affine maps of space, x -> x A^T + b: a shear and stretch, a turn, a shift.
 
-    The turn is about the vertical through `middle` (1, 3), metres. Returns A (n, 3, 3) and
-    b (n, 1, 3), float32.
+    The turn is about the vertical through `middle` (1, 3). Returns A (n, 3, 3), b (n, 1, 3).
     """
 
     def symmetric(*shape: int) -> Tensor:
-        uniform = torch.rand(shape, generator=generator, device=generator.device).cpu()
-        return 2 * uniform - 1
+        return 2 * torch.rand(shape, generator=generator, device=generator.device).cpu() - 1
 
     angle, zero, one = TURN * symmetric(n), torch.zeros(n), torch.ones(n)
     cos, sin = angle.cos(), angle.sin()
@@ -261,8 +254,7 @@ class WindowSampler:
         augment: `batch` moves each scene by an affine map of its own, where the recording tells the
             positions in a state.
 
-    Raises:
-        ValueError: the demonstrations do not fit the policy: dimensions, points or length.
+    Raises ValueError for demonstrations that do not fit the policy: dimensions, points or length.
     """
 
     def __init__(
@@ -302,21 +294,17 @@ class WindowSampler:
         self.episode_of = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))  # (W,)
 
     def check_fit(self, demonstrations: Demonstrations) -> None:
-        """Raises ValueError where recording and policy disagree."""
         config, (_, N, _) = self.config, demonstrations.points.shape
         found = (demonstrations.state.shape[1], demonstrations.action.shape[1], N)
         known = (config.state_dim, config.action_dim, config.num_points)
         if found[:2] != known[:2] or N < config.num_points:
-            raise ValueError(
-                f"{self.task}: state, action, points have {found} dimensions, the policy's have "
-                f"{known}: use a checkpoint trained on such data"
-            )
+            what = f"state, action, points have {found} dimensions, the policy's have {known}"
+            raise ValueError(f"{self.task}: {what}: use a checkpoint trained on such data")
         T = max(math.ceil((e.stop - e.start) / config.demo_stride) for e in self.episodes)
         if config.demo_encoder != "none" and T > config.demo_positions:
-            raise ValueError(
-                f"{self.task}: a demonstration has {T} frames (every {config.demo_stride}th), "
-                f"the policy {config.demo_positions} positions: cut it, or train on such data"
-            )
+            what = f"a demonstration has {T} frames (every {config.demo_stride}th)"
+            most = f"the policy {config.demo_positions} positions"
+            raise ValueError(f"{self.task}: {what}, {most}: cut it, or train on such data")
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -327,11 +315,8 @@ class WindowSampler:
         None is of the episode `without`, unless that is the only one.
         """
         others = (self.episode_of != without).nonzero()[:, 0]
-        count, device = len(others) or len(self), generator.device
-        if n <= count:
-            chosen = torch.randperm(count, generator=generator, device=device)[:n]
-        else:
-            chosen = torch.randint(count, (n,), generator=generator, device=device)
+        W, how = len(others) or len(self), {"generator": generator, "device": generator.device}
+        chosen = torch.randperm(W, **how)[:n] if n <= W else torch.randint(W, (n,), **how)
         return self.gather(others[chosen.cpu()] if len(others) else chosen)
 
     def gather(self, indices: Tensor) -> dict[str, Tensor]:
@@ -392,63 +377,7 @@ class WindowSampler:
         return dict(zip(names, (place(points), state, action)))
 
 
-# ---- Pictures ------------------------------------------------------------------------------------
-
-
-def draw_demonstration(
-    demonstrations: Demonstrations, out: str | Path, episode: int = 0, columns: int = 6
-) -> None:
-    """Draws one episode to a picture: its clouds along time, colored by height, and the actions."""
-    from matplotlib.figure import Figure  # only here: training draws nothing
-
-    frames = demonstrations.episode(episode)
-    clouds = demonstrations.points[frames].astype(np.float32)  # (T, N, 3)
-    low, high = clouds.min((0, 1)), clouds.max((0, 1)) + 1e-6
-    positions = 3 * demonstrations.meta.get("positions_in_state", 0)
-    known = demonstrations.state[frames, :positions].reshape(len(clouds), -1, 3)
-
-    figure = Figure(figsize=(2.6 * columns, 6), layout="constrained")
-    grid = figure.add_gridspec(2, columns, height_ratios=(1.5, 1))
-    for column, index in enumerate(np.linspace(0, len(clouds) - 1, columns).round().astype(int)):
-        axes = figure.add_subplot(grid[0, column], projection="3d", computed_zorder=False)
-        height = {"c": clouds[index, :, 2], "vmin": low[2], "vmax": high[2]}
-        axes.scatter(*clouds[index].T, s=2, cmap="viridis", **height)
-        axes.scatter(*known[index].T, c="red", s=14)  # hand and fingers
-        axes.set(**{f"{axis}lim": ends for axis, ends in zip("xyz", zip(low, high))})
-        axes.set_title(f"frame {index}")
-        axes.set_box_aspect(high - low, zoom=1.3)
-        axes.view_init(35, -30)
-        axes.tick_params(labelsize=5, pad=-3)
-
-    axes = figure.add_subplot(grid[1, :])
-    for index, values in enumerate(demonstrations.action[frames].T):
-        axes.plot(values, label=f"action {index}")
-    axes.set(xlabel="frame", ylabel="action")
-    axes.legend(loc="upper right", ncols=4)
-    figure.suptitle(f"{demonstrations.task}, episode {episode}: {demonstrations.instruction}")
-    write_atomically(out, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
-
-
-# ---- Command line --------------------------------------------------------------------------------
-
-
-def parse(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Draws a recording of demonstrations.")
-    parser.add_argument("--show", metavar="FILE", required=True, help="draw its first episode")
-    parser.add_argument("--out", help="the picture (default: FILE with .png)")
-    return parser.parse_args(argv)
-
-
-def main(argv: list[str] | None = None) -> None:
-    args = parse(argv)
-    out = Path(args.out or args.show).with_suffix(".png")
-    draw_demonstration(load_demonstrations(args.show), out)
-    print(f"wrote {out}")
-
-
 if __name__ == "__main__":
-    try:
-        main()
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    from scripts import command_line, show  # not needed where this file is copied to
+
+    command_line(show)

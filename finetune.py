@@ -4,11 +4,10 @@
     python finetune.py --task novel                  # all novel tasks of the suite
     python finetune.py --data demos.npz --steps 500  # own demonstrations, in data.py's format
 
-The EMA policy of meta-training is copied and trained with AdamW on windows of the task's
-demonstrations, each step with a reference demonstration drawn from them; the three parts of the
-policy have learning rates of their own. An EMA of the adapted policy is what is kept. There is no
-warm-up and no decay. On a Meta-World task the policy is then rolled out, before and after: the
-difference is what adaptation bought.
+The EMA policy of meta-training is trained on with AdamW, each step on windows of the task's
+demonstrations and one of them as reference; its three parts have learning rates of their own, and
+there is neither warm-up nor decay. What is kept is an EMA again. On a Meta-World task the policy is
+rolled out before and after: the difference is what adaptation bought.
 """
 
 import argparse
@@ -74,11 +73,8 @@ def adapt_policy(
         learning_rates: of the parameter groups `vision`, `diffusion` and `other`.
         seed: of batches, demonstrations and noise.
 
-    Yields:
-        (steps done, loss, the moving average of the adapted policy) after each step.
-
-    Raises:
-        ValueError: the loss is not finite.
+    Yields (steps done, loss, the moving average of the adapted policy) after each step. Raises
+    ValueError if the loss is not finite.
     """
     adapted = copy.deepcopy(policy).train()  # line 2
     average = ema_model(adapted)
@@ -93,8 +89,7 @@ def adapt_policy(
         noise = adapted.draw_noise_and_timesteps(batch, generator)  # line 10
         loss = adapted.loss(text=text[None], **windows, **noise)  # lines 8 to 14
         if not torch.isfinite(loss):
-            task = sampler.task
-            raise ValueError(f"the loss is not finite at step {step} on {task}: lower the --lr-...")
+            raise ValueError(f"{sampler.task}: loss not finite at step {step}, lower the --lr-...")
 
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -118,8 +113,8 @@ def adapt_checkpoint(
     """Adapts the policy of a checkpoint to the task of a recording, on the device of `text`.
 
     Writes adapted.pt (a checkpoint like any other; after the steps in `curve` adapted-STEP.pt),
-    metrics.jsonl and config.json to `folder`, and returns what config.json says: the settings used,
-    and the `seconds` of the steps. Raises ValueError where the two files do not fit each other.
+    metrics.jsonl and config.json to `folder`; returns what config.json says, `seconds` among it.
+    Raises ValueError where the two files do not fit each other.
     """
     policy, info = load_checkpoint(checkpoint, text.device, needs=evaluate.TRAINED)
     demonstrations = load_demonstrations(data).take(settings.demonstrations)
@@ -180,7 +175,7 @@ def main(argv: list[str] | None = None) -> None:
     settings = Settings().given(args)
     device = scripts.pick_device(args.device)
 
-    # Which tasks, from which policy: a recording of one's own, tasks by name, or all novel ones
+    # Which tasks, and from which policy
     file = Path(args.data) if args.data.endswith(".npz") else None
     if args.task is None and file is None:
         raise ValueError("name a task of Meta-World with --task, or a recording with --data")

@@ -68,21 +68,14 @@ def meta_gradient(
     Args:
         loss_fn, params, lr, steps, first_order: as in `adapt`.
         tasks: (support, query) batches, one pair a task. An iterator is read `vectorize` tasks at a
-            time, and their graph is freed before the next are read: memory does not grow with the
-            number of tasks.
+            time, and their graph is freed before the next are read: memory does not grow.
         vectorize: so many tasks run at once, under `torch.vmap`: the same numbers, up to twice as
-            fast, with memory for all of these. Their batches must have equal shapes and hold
-            tensors only.
+            fast. Their batches must have equal shapes and hold tensors only.
 
     Returns:
         (gradients, after, before): name -> tensor, and the query losses with the adapted parameters
-        and with the given ones, both (tasks,).
-
-    Raises:
-        ValueError: `tasks` is empty, or `vectorize` is less than 1.
+        and with the given ones, both (tasks,). Raises ValueError without a task.
     """
-    if vectorize < 1:
-        raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
     # If they required grad, autograd would record all of this once more, beneath torch.func.
     params = {name: p.detach() for name, p in params.items()}
 

@@ -28,7 +28,7 @@ from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
 # ---- Configuration -------------------------------------------------------------------------------
@@ -79,8 +79,7 @@ class PolicyConfig:
         object.__setattr__(self, "unet_widths", tuple(self.unet_widths))
 
         if (
-            not self.pointnet_widths
-            or not self.unet_widths
+            not (self.pointnet_widths and self.unet_widths)
             or self.vmt_layers + self.u2t_layers > 99
         ):
             raise ValueError("each network needs a width, and VMT and U2T at most 99 layers")
@@ -91,10 +90,6 @@ class PolicyConfig:
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"{name} is {value!r}; use one of {', '.join(known)}")
 
-        if self.policy != "dami" and self.reads_task:
-            raise ValueError(f"{self.policy} reads no task: use demo_encoder none and tcfm none")
-        if self.policy in ("flow", "freq") and self.sampler != "ddim":
-            raise ValueError(f"{self.policy} has a sampler of its own: leave out {self.sampler}")
         H, To, Ta = self.horizon, self.n_obs_steps, self.n_action_steps
         if Ta > (most := H - To + 1):
             raise ValueError(f"n_action_steps {Ta}: horizon {H} has {most} after observation {To}")
@@ -192,9 +187,8 @@ class TransformerBlock(nn.Module):
 class PointNetEncoder(nn.Module):
     """A cloud to one feature: the same MLP on every point, the maximum over points, a projection.
 
-    The maximum makes it blind to the order of the points. It also passes no gradient to a point
-    that wins in no channel, so that only winners are differentiated (`WinningPoints`, in the last
-    section): the same feature and the same gradients, for a third of the work.
+    The maximum makes it blind to the order of the points. It passes no gradient to a point that
+    wins in no channel, so that only winners are differentiated (`WinningPoints`): a third of them.
     """
 
     def __init__(self, widths: tuple[int, ...] = (64, 128, 256), feature_dim: int = 64):
@@ -411,7 +405,7 @@ class ConditionalUNet1d(nn.Module):
         return self.head(x).transpose(1, 2)  # (B, H, A)
 
 
-# ---- Diffusion -----------------------------------------------------------------------------------
+# ---- Diffusion and normalization -----------------------------------------------------------------
 
 
 class DiffusionSchedule(nn.Module):
@@ -443,9 +437,8 @@ class DiffusionSchedule(nn.Module):
     def step(self, prediction: Tensor, k: int, noisy: Tensor) -> Tensor:
         """One DDIM step from k to k - K / inference_steps, (B, H, A) -> (B, H, A).
 
-        The noise that is put back is the one that leads from the prediction to `noisy`, before
-        clipping, as in today's diffusers. DP3 pins diffusers 0.11.1, which puts back the predicted
-        sample itself (sampler `dp3`): x' = sqrt(a') clip(x0) + sqrt(1 - a') x0.
+        The noise that is put back leads from the prediction, not clipped, to `noisy`. DP3 pins
+        diffusers 0.11.1, which puts back the predicted sample itself (sampler `dp3`).
         """
         stride = self.diffusion_steps // self.inference_steps
         a = self.alphas_cumprod[k]
@@ -454,9 +447,6 @@ class DiffusionSchedule(nn.Module):
         if self.sampler == "dp3":
             noise = prediction
         return a_next.sqrt() * prediction.clamp(-1, 1) + (1 - a_next).sqrt() * noise
-
-
-# ---- Normalization -------------------------------------------------------------------------------
 
 
 class Normalizer(nn.Module):
@@ -491,7 +481,7 @@ class Normalizer(nn.Module):
         return x * getattr(self, f"{name}_scale") + getattr(self, f"{name}_center")
 
 
-# ---- The policy ----------------------------------------------------------------------------------
+# ---- The policy, and its moving average ----------------------------------------------------------
 
 Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None: no task is read
 
@@ -570,7 +560,7 @@ class DAMIPolicy(nn.Module):
         action: Tensor,
         noise: Tensor,
         timesteps: Tensor,
-        **task: Tensor,
+        **task,
     ) -> Tensor:
         """The diffusion loss, () float: squared error of the predicted clean actions (Eq. 1).
 
@@ -596,11 +586,7 @@ class DAMIPolicy(nn.Module):
 
     @torch.no_grad()
     def sample_actions(
-        self,
-        points: Tensor,
-        state: Tensor,
-        context: Context,
-        generator: torch.Generator | None = None,
+        self, points: Tensor, state: Tensor, context: Context, generator: Generator | None = None
     ) -> Tensor:
         """Draws an action chunk by DDIM from Gaussian noise.
 
@@ -640,7 +626,7 @@ class DAMIPolicy(nn.Module):
             if x.shape != expected[name]:
                 raise ValueError(f"{name} is {tuple(x.shape)}, the policy takes {expected[name]}")
 
-    def draw_noise_and_timesteps(self, n: int, generator: torch.Generator) -> dict[str, Tensor]:
+    def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
         """Draws what makes `loss` pure: noise (n, H, A) and timesteps (n,) int64."""
         config, device = self.config, self.normalizer.action_scale.device
         source = {"generator": generator, "device": generator.device}
@@ -649,14 +635,10 @@ class DAMIPolicy(nn.Module):
         return {"noise": noise.to(device), "timesteps": timesteps.to(device)}
 
 
-# ---- Moving average ------------------------------------------------------------------------------
-
-
 def ema_model(policy: DAMIPolicy) -> AveragedModel:
     """The exponential moving average of a policy in training; the averaged policy is its `.module`.
 
-    `.update_parameters(policy)` belongs after each step. The decay grows: min(0.9999,
-    1 - (1 + step)^-0.75), the paper's.
+    `.update_parameters(policy)` belongs after each step. The decay grows as the paper's.
     """
 
     @torch.no_grad()
@@ -671,10 +653,10 @@ def ema_model(policy: DAMIPolicy) -> AveragedModel:
 
 
 class LayerNorm(nn.LayerNorm):
-    """Layer normalization whose weight and bias are applied outside the fused function.
+    """Layer normalization, its weight and bias applied outside PyTorch's fused function (2.13).
 
-    Inside it (torch 2.13) the second derivative is wrong, silently, under `torch.vmap` with another
-    weight for each entry: the vectorized meta-gradient, where every task has adapted weights.
+    Inside it the second derivative is wrong, silently, under `torch.vmap` with another weight for
+    each entry: the vectorized meta-gradient, where every task has adapted weights.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -722,9 +704,8 @@ class Conv1d(nn.Conv1d):
 class WinningPoints(torch.autograd.Function):
     """Which points of each cloud win the maximum over points in some channel of a PointNet.
 
-    About a third of 128 points do, a sixth of 512. A pass without gradient finds them, a few clouds
-    at a time, whose activations stay in the CPU's cache. Their number depends on the data, which
-    `torch.vmap` allows only in the `vmap` rule of a Function.
+    A third of 128 do, a sixth of 512. A pass without gradient finds them, a few clouds at a time,
+    which stay in the CPU's cache. Their number depends on the data: `vmap` needs a rule of its own.
     """
 
     @staticmethod

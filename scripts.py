@@ -32,13 +32,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
-from baselines import build_policy
-from data import WindowSampler, write_atomically
+from baselines import PRESETS, build_policy
+from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
 from model import DAMIPolicy, PolicyConfig
 
 # ---- Settings: each said once, as a field --------------------------------------------------------
@@ -162,6 +163,112 @@ def report_facts(
     return {"hardware": hardware(device), "date": date, "command": command}
 
 
+# ---- Own recordings ------------------------------------------------------------------------------
+
+OWN_FRAMES = 500  # the paper's positions on the real robot
+
+
+def own_recordings(folder: str | Path, others: Iterable[str]) -> dict[str, Path]:
+    """Task -> file of the recordings in a folder, if none is of a task among `others`; else {}."""
+    if not Path(folder).is_dir():
+        raise ValueError(f"there is no folder {folder}: with --suite ml10, experts fill it")
+    paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
+    return {} if set(paths) & set(others) else paths
+
+
+def choose_config(
+    args: argparse.Namespace, preset: str, recorded: dict[str, Demonstrations], own: bool
+) -> PolicyConfig:
+    """A preset's architecture with what was given, and with the dimensions of own recordings."""
+    recordings = list(recorded.values())
+    names = ("demo_encoder", "tcfm", "num_points", "sampler")
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    config = replace(PRESETS[args.policy or "dami"][preset], **given)
+    if own:
+        episodes = [d.episode(i) for d in recordings for i in range(len(d))]
+        longest = max(OWN_FRAMES, *(e.stop - e.start for e in episodes))
+        config = replace(
+            config,
+            state_dim=recordings[0].state.shape[1],
+            action_dim=recordings[0].action.shape[1],
+            num_points=args.num_points
+            or min(config.num_points, *(d.points.shape[1] for d in recordings)),
+            demo_positions=math.ceil(longest / config.demo_stride),
+        )
+    return config
+
+
+# ---- Pictures of recordings ----------------------------------------------------------------------
+
+
+def draw_demonstration(
+    demonstrations: Demonstrations, out: str | Path, episode: int = 0, columns: int = 6
+) -> None:
+    """Draws one episode to a picture: its clouds along time, colored by height, and the actions.
+
+    A recording's boxes, `workspace` and `tcp_box` in its meta, are drawn where they are known.
+    """
+    from itertools import combinations, product
+
+    from matplotlib.figure import Figure  # only here: training draws nothing
+
+    frames, meta = demonstrations.episode(episode), demonstrations.meta
+    clouds = demonstrations.points[frames].astype(np.float32)  # (T, N, 3)
+    positions = 3 * meta.get("positions_in_state", 0)
+    known = demonstrations.state[frames, :positions].reshape(len(clouds), -1, 3)
+    boxes = {name: np.array(meta[name]) for name in ("workspace", "tcp_box") if name in meta}
+    seen = np.concatenate([clouds.reshape(-1, 3), known.reshape(-1, 3), *boxes.values()])
+    low, high = seen.min(0), seen.max(0)
+    margin = np.maximum(high - low, 0.1 * max((high - low).max(), 1e-3)) / 2  # of a plane, too
+    low, high = (low + high) / 2 - margin, (low + high) / 2 + margin
+
+    columns = min(columns, len(clouds))
+    figure = Figure(figsize=(max(2.6 * columns, 8), 6 if columns > 1 else 9), layout="constrained")
+    grid = figure.add_gridspec(2, columns, height_ratios=(1.5 if columns > 1 else 5, 1))
+    for column, index in enumerate(np.linspace(0, len(clouds) - 1, columns).round().astype(int)):
+        axes = figure.add_subplot(grid[0, column], projection="3d", computed_zorder=False)
+        height = {"c": clouds[index, :, 2], "vmin": low[2], "vmax": high[2]}
+        axes.scatter(*clouds[index].T, s=2, cmap="viridis", **height)
+        axes.scatter(*known[index].T, c="red", s=14)  # hand and fingers
+        for box, color in zip(boxes.values(), ("black", "red")):
+            for a, b in combinations(product(*box.T), 2):
+                if np.equal(a, b).sum() == 2:  # an edge
+                    axes.plot(*zip(a, b), color=color, lw=0.5)
+        axes.set(**{f"{axis}lim": ends for axis, ends in zip("xyz", zip(low, high))})
+        axes.set_title(f"frame {index}")
+        axes.set_box_aspect(high - low, zoom=1.3 if columns > 1 else 1)
+        axes.view_init(35, -30)
+        axes.tick_params(labelsize=5, pad=-3)
+
+    axes = figure.add_subplot(grid[1, :])
+    for index, values in enumerate(demonstrations.action[frames].T):
+        axes.plot(values, marker=".", label=f"action {index}")
+    axes.set(xlabel="frame", ylabel="action")
+    axes.legend(loc="upper right", ncols=4)
+    title = f"{demonstrations.task}, episode {episode}: {demonstrations.instruction}"
+    figure.suptitle(title.replace("$", r"\$"))  # no formula
+    write_atomically(out, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
+
+
+def parse_show(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Draws a recording of demonstrations.")
+    parser.add_argument("--show", metavar="FILE", required=True, help="draw an episode of it")
+    parser.add_argument("--episode", type=int, default=0, help="which (default: 0, the first)")
+    parser.add_argument("--out", help="the picture (default: FILE with .png)")
+    return parser.parse_args(argv)
+
+
+def show(argv: list[str] | None = None) -> None:
+    """The command line of data.py."""
+    args = parse_show(argv)
+    out = Path(args.out or args.show).with_suffix(".png")
+    recorded = load_demonstrations(args.show)
+    if not 0 <= args.episode < len(recorded):
+        raise ValueError(f"{args.show} holds episodes 0 to {len(recorded) - 1}, not {args.episode}")
+    draw_demonstration(recorded, out, args.episode)
+    print(f"wrote {out}")
+
+
 # ---- Checkpoints ---------------------------------------------------------------------------------
 
 CHECKPOINT_FORMAT = "DAMI checkpoint 1"
@@ -247,6 +354,19 @@ def digest(samplers: dict[str, WindowSampler]) -> str:
     return sha.hexdigest()
 
 
+def save_run(
+    folder: Path,
+    policy: DAMIPolicy,
+    ema: AveragedModel,
+    optimizer: torch.optim.Optimizer,
+    **info: Any,
+) -> None:
+    """Writes last.pt: all that `restore` needs, and `info`."""
+    training = {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
+    training["n_averaged"] = ema.n_averaged
+    save_checkpoint(folder / "last.pt", ema.module, training=training, **info)
+
+
 def restore(
     path: Path,
     policy: DAMIPolicy,
@@ -299,6 +419,14 @@ def claim_folder(folder: Path, overwrite: bool) -> None:
         raise ValueError(f"{folder} already holds {old[0].name}: add --overwrite, or another --out")
     for path in old:
         path.unlink()
+
+
+def check_run(folder: Path, resume: bool) -> None:
+    """Raises ValueError for a run that cannot be resumed, or that a new one would overwrite."""
+    if resume and not (folder / "last.pt").exists():
+        raise ValueError(f"there is no run to resume in {folder}: look at --out")
+    if not resume and any(folder.glob("*.pt")):
+        raise ValueError(f"{folder} already holds a run: add --resume, or another --out")
 
 
 @contextmanager

@@ -46,8 +46,7 @@ from simulator import INSTRUCTIONS, SUITES, collect, suite_tasks
 class Settings(Flags):
     """What a run is made of. Each field is a flag, and is kept in every checkpoint (`arguments`).
 
-    The defaults are the paper's: 3000 epochs of 18 outer steps, and its hyperparameter table,
-    which leaves out the length of the warm-up (DP3's is taken).
+    The defaults are the paper's (3000 epochs of 18 outer steps), but for the warm-up, DP3's.
     """
 
     suite: str = setting("ml10", "ml10 or ml45 (default: ml10, or own recordings in --data)")
@@ -90,7 +89,6 @@ SETTINGS = {
     ),
 }
 # fmt: on
-OWN_FRAMES = 500  # the paper's positions on the real robot
 EVALUATION_SEED = 0  # of the goals; the same for every seed of training
 SAVE_SECONDS = 20  # between two savings of last.pt: what a killed run loses at most
 PER_WINDOW = ("points", "state", "action", "noise", "timesteps")  # of a batch; the rest: per task
@@ -155,6 +153,24 @@ def learning_rate(step: int, settings: Settings) -> float:
     if step < warmup:
         return peak * (step + 1) / warmup
     return peak * 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
+
+
+def initialize(
+    config: PolicyConfig,
+    settings: Settings,
+    samplers: dict[str, WindowSampler],
+    device: torch.device,
+) -> tuple[DAMIPolicy, AveragedModel, torch.optim.Optimizer]:
+    """A fresh policy, normalized to all windows (line 1), its moving average, and AdamW."""
+    torch.manual_seed(settings.seed)
+    policy = baselines.build_policy(config).to(device)
+    parts = ("points", "state", "action")
+    seen = {part: torch.cat([getattr(s, part) for s in samplers.values()]) for part in parts}
+    policy.normalizer.fit(**seen)
+    optimizer = torch.optim.AdamW(
+        policy.parameters(), lr=settings.lr, betas=(0.95, 0.999), weight_decay=1e-6, fused=True
+    )
+    return policy, ema_model(policy), optimizer
 
 
 def meta_train(
@@ -234,56 +250,6 @@ def meta_train(
         yield step + 1, figures | {"loss": loss.item(), "gradient_norm": norm.item()}
 
 
-# ---- What a run is made from ---------------------------------------------------------------------
-
-
-def own_recordings(folder: str | Path) -> dict[str, Path]:
-    """Task -> file of the recordings in a folder, if none is of a Meta-World task; else {}."""
-    if not Path(folder).is_dir():
-        raise ValueError(f"there is no folder {folder}: with --suite ml10, experts fill it")
-    paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
-    return {} if set(paths) & set(INSTRUCTIONS) else paths
-
-
-def choose_config(
-    args: argparse.Namespace, preset: str, recordings: list[Demonstrations], own: bool
-) -> PolicyConfig:
-    """A preset's architecture with what was given, and with the dimensions of own recordings."""
-    names = ("demo_encoder", "tcfm", "num_points", "sampler")
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    config = replace(baselines.PRESETS[args.policy][preset], **given)
-    if own:
-        episodes = [d.episode(i) for d in recordings for i in range(len(d))]
-        longest = max(OWN_FRAMES, *(e.stop - e.start for e in episodes))
-        config = replace(
-            config,
-            state_dim=recordings[0].state.shape[1],
-            action_dim=recordings[0].action.shape[1],
-            num_points=args.num_points
-            or min(config.num_points, *(d.points.shape[1] for d in recordings)),
-            demo_positions=math.ceil(longest / config.demo_stride),
-        )
-    return config
-
-
-def initialize(
-    config: PolicyConfig,
-    settings: Settings,
-    samplers: dict[str, WindowSampler],
-    device: torch.device,
-) -> tuple[DAMIPolicy, AveragedModel, torch.optim.Optimizer]:
-    """A fresh policy, normalized to all windows (line 1), its moving average, and AdamW."""
-    torch.manual_seed(settings.seed)
-    policy = baselines.build_policy(config).to(device)
-    parts = ("points", "state", "action")
-    seen = {part: torch.cat([getattr(s, part) for s in samplers.values()]) for part in parts}
-    policy.normalizer.fit(**seen)
-    optimizer = torch.optim.AdamW(
-        policy.parameters(), lr=settings.lr, betas=(0.95, 0.999), weight_decay=1e-6, fused=True
-    )
-    return policy, ema_model(policy), optimizer
-
-
 # ---- Command line --------------------------------------------------------------------------------
 
 
@@ -295,10 +261,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--resume", action="store_true", help="go on from the run's last.pt")
     scripts.add_common_flags(add)
     add = parser.add_argument_group("architecture (default: the preset's)").add_argument
-    add("--policy", choices=CHOICES["policy"], default="dami", help="see baselines.py")
-    add("--sampler", choices=CHOICES["sampler"], help="DDIM as published, or as DP3 runs it")
-    add("--demo-encoder", choices=CHOICES["demo_encoder"], help="encoder of the demonstration")
-    add("--tcfm", choices=CHOICES["tcfm"], help="the U-Net level that reads it")
+    for name, choices in CHOICES.items():
+        add(f"--{name.replace('_', '-')}", choices=choices, help="see model.PolicyConfig")
     add("--num-points", type=int, help="points of each cloud that the policy reads")
     Settings.add_flags(parser.add_argument_group("settings (default: the preset's)"))
     return parser.parse_args(argv)
@@ -307,15 +271,17 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
     device = scripts.pick_device(args.device)
-    own = own_recordings(args.data) if args.data and not args.suite else {}  # task -> file
+    own = {}  # task -> file
+    if args.data and not args.suite:
+        own = scripts.own_recordings(args.data, INSTRUCTIONS)
     default = "paper" if device.type == "cuda" else "small"
     preset = choose(args.preset or default, PRESETS, "preset")
     suite = "own" if own else choose(args.suite or "ml10", SUITES, "suite")
-    settings = SETTINGS[preset]
-    if args.policy != "dami" or args.demo_encoder == "none":  # the instruction alone tells the task
+    settings, policy = SETTINGS[preset], args.policy or "dami"
+    if policy != "dami" or args.demo_encoder == "none":  # the instruction alone tells the task
         settings = replace(settings, instruction_dropout=0.0, backwards=0.0)
     settings = settings.given(args, suite=suite)
-    name = preset if args.policy == "dami" else f"{args.policy}-{preset}"
+    name = preset if policy == "dami" else f"{policy}-{preset}"
     if own:  # all demonstrations unless told otherwise, and no simulator to be rolled out in
         settings = replace(settings, demonstrations=args.demonstrations, episodes=0)
     tasks = list(own) or suite_tasks(suite)[0]
@@ -327,10 +293,7 @@ def main(argv: list[str] | None = None) -> None:
         if rank == 0:
             where = f"{device} ({scripts.hardware(device)})"
             print(f"preset {name} on {where}, {len(tasks)} tasks, in {folder}", flush=True)
-            if args.resume and not (folder / "last.pt").exists():
-                raise ValueError(f"there is no run to resume in {folder}: look at --out")
-            if not args.resume and any(folder.glob("*.pt")):
-                raise ValueError(f"{folder} already holds a run: add --resume, or another --out")
+            scripts.check_run(folder, args.resume)
             if not own:
                 collect(tasks, args.data or "data", settings.demonstrations, workers=args.workers)
         if world > 1:
@@ -360,7 +323,8 @@ def run(
     # Demonstrations and their windows, the policy, and the state in which the run was left
     n, rest = settings.demonstrations, settings.after_success
     recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
-    config = choose_config(args, settings.preset, list(recorded.values()), settings.suite == "own")
+    own = settings.suite == "own"
+    config = scripts.choose_config(args, settings.preset, recorded, own)
 
     def windows(demonstrations: dict[str, Demonstrations]) -> dict[str, WindowSampler]:
         how = (config, device, rest, settings.augment)
@@ -388,12 +352,6 @@ def run(
         scripts.write_text(folder / "config.json", json.dumps(written, indent=1))
     if leader:
         scripts.rewind_metrics(folder, start)
-
-    def save_last() -> None:
-        training = {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
-        training["n_averaged"] = ema.n_averaged
-        now = {"step": step, "seconds": seconds, "training": training, "data": data}
-        save_checkpoint(folder / "last.pt", ema.module, **about, **now)
 
     def measure(step: int) -> evaluate.Successes | None:
         """Evaluates the checkpoint of this step if that is due, and was not done before."""
@@ -425,7 +383,8 @@ def run(
                     checkpoint = folder / f"ema-{step:05d}.pt"
                     save_checkpoint(checkpoint, ema.module, **about, step=step, seconds=seconds)
                 if milestone or stop.requested or time.monotonic() - saved > SAVE_SECONDS:
-                    save_last()
+                    now = {"step": step, "seconds": seconds, "data": data}
+                    scripts.save_run(folder, policy, ema, optimizer, **about, **now)
                     saved = time.monotonic()
 
             if stop.requested and step < settings.steps:
@@ -440,8 +399,8 @@ def run(
         evaluate.draw_curves(folder)
 
     if successes:
-        title = f"{settings.suite}, base tasks, {settings.preset}, {config.policy}"
-        facts |= {"title": title, "episodes a task": settings.episodes, "seed": EVALUATION_SEED}
+        facts |= {"title": f"{settings.suite}, base tasks, {settings.preset}, {config.policy}"}
+        facts |= {"episodes a task": settings.episodes, "seed": EVALUATION_SEED}
         facts |= {"training": f"{seconds / 60:.1f} min", "training seed": settings.seed}
         columns = {"last checkpoint": successes}
         print(f"\n{evaluate.write_report(folder, columns, facts, settings.suite)}")

@@ -337,7 +337,7 @@ def test_a_checkpoint_gives_back_the_policy_of_its_name(name, tmp_path):
     policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
     scripts.save_checkpoint(tmp_path / "a.pt", policy)
     again, _ = scripts.load_checkpoint(tmp_path / "a.pt")
-    assert type(again) is type(policy) and again.config == policy.config
+    assert type(again) is baselines.POLICIES[name] and again.config == policy.config
     assert torch.equal(sample(again, batch), sample(policy, batch))
 
 
@@ -394,7 +394,10 @@ def test_a_policy_is_trained_resumed_adapted_and_rolled_out(
 ):
     argv = [*FEW, "--policy", name, "--data", str(recorded), "--vectorize", "3"]
     argv += ["--steps", "2", "--checkpoint-every", "2"]
+    built, ema = [], model.ema_model
+    monkeypatch.setattr(train, "ema_model", lambda policy: (built.append(policy), ema(policy))[1])
     train.main([*argv, "--out", "run"])
+    assert type(built[0]) is baselines.POLICIES[name]
     losses = [line for line in metrics(own_folder / "run") if "loss" in line]
     assert [line["step"] for line in losses] == [1, 2]
     assert all(math.isfinite(x["loss"]) and x["loss"] != x["loss_before"] for x in losses)

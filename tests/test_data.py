@@ -409,7 +409,7 @@ def test_a_setting_out_of_bounds_is_refused_in_the_words_of_the_command_line(cha
 
 def test_show_draws_a_picture(tmp_path, capsys):
     data.save_demonstrations(tmp_path / "reach.npz", recording())
-    data.main(["--show", str(tmp_path / "reach.npz")])
+    scripts.show(["--show", str(tmp_path / "reach.npz")])
     assert (tmp_path / "reach.png").stat().st_size > 10_000
     assert "reach.png" in capsys.readouterr().out
 
@@ -421,7 +421,7 @@ def say(error):
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda: data.main(["--show", "nothing.npz"]), "nothing.npz is missing"),
+        (lambda: scripts.show(["--show", "nothing.npz"]), "nothing.npz is missing"),
         (lambda: scripts.choose("shelf-plce", ["shelf-place", "push"], "task"), "'shelf-place'?"),
         (lambda: scripts.choose("x", ["push", "pull"], "task"), "choose one of: pull, push"),
         (lambda: say(PermissionError("no access")), "no access"),

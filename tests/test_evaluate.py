@@ -144,7 +144,7 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(
 ):
     calls = []
 
-    def measured(checkpoint, paths, text, episodes, seed, workers, device, n, blank):
+    def measured(checkpoint, paths, text, episodes, seed, workers, device, n, blank, sampler):
         calls.append(({t: path.stem for t, path in paths.items()}, text, blank))
         return {task: [len(calls) == 1] * episodes for task in paths}
 

@@ -169,7 +169,7 @@ def test_a_name_that_is_no_name_writes_nowhere(run, task, capsys):
 def test_an_adaptation_that_diverges_stops_and_writes_nothing(run, recorded, capsys):
     argv = adapting(run, recorded, "--lr-diffusion 1e30")
     message = fails(finetune, [*argv, "--steps", "20"], capsys)
-    assert "not finite at step" in message and "door-close" in message
+    assert "loss not finite at step" in message and "door-close" in message
     assert not list(Path().rglob("adapted.pt"))
 
 

@@ -43,9 +43,11 @@ OURS = [path.stem for path in ROOT.glob("*.py")]
 
 
 def imports(path):
-    """The top-level names of all modules that a file imports, wherever in it."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    """The top-level names of all modules that a file imports, wherever in it, but as a script."""
+    names, tree = set(), ast.parse(path.read_text())
+    is_script = lambda n: isinstance(n, ast.If) and "__main__" in ast.unparse(n.test)  # noqa: E731
+    tree.body = [n for n in tree.body if not is_script(n)]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

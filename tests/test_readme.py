@@ -7,13 +7,15 @@ from pathlib import Path
 
 import pytest
 
+import scripts
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"^```bash\n(.*?)^```", README, re.M | re.S)
 LINES = [re.split(r"\s+# ", line)[0].strip() for block in BLOCKS for line in block.splitlines()]
 INLINE = re.findall(r"`((?:OMP_NUM_THREADS=\d+ )?(?:python|torchrun)\s[^`]+)`", README)
 COMMANDS = sorted({re.sub(r"\s+", " ", command) for command in LINES + INLINE if command})
-PARSERS = ("data", "simulator", "train", "finetune", "evaluate", "robot")
+PARSERS = ("simulator", "train", "finetune", "evaluate", "robot")
 
 
 def test_the_readme_has_the_two_commands_and_many_more():
@@ -35,6 +37,8 @@ def test_every_command_parses(command, capsys, monkeypatch):
         assert all((ROOT / file).is_file() for file in re.findall(r"-r (\S+)", command))
     elif words[0] == "torchrun":
         importlib.import_module("train").parse(words[words.index("train.py") + 1 :])
+    elif words[1] == "data.py":
+        scripts.parse_show(words[2:])
     elif words[1].removesuffix(".py") in PARSERS:
         importlib.import_module(words[1].removesuffix(".py")).parse(words[2:])
     elif words[1] == "-m":
@@ -43,9 +47,9 @@ def test_every_command_parses(command, capsys, monkeypatch):
             with pytest.raises(SystemExit) as end:
                 module.main([*words[3:], "--help"])
             assert end.value.code == 0
-    elif words[1] == "model.py":
+    elif words[1] == "baselines.py":
         monkeypatch.setattr("sys.argv", words[1:])
-        importlib.import_module("model").main()
-        assert "unet" in capsys.readouterr().out
+        importlib.import_module("baselines").main()
+        assert "mamba" in capsys.readouterr().out
     else:
         assert words[1:3] == ["-X", "dev"]

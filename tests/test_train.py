@@ -109,7 +109,7 @@ def test_training_leaves_everything_that_it_promises(run):
     names += " success.json success.md success.png"
     assert sorted(path.name for path in run.iterdir()) == names.split()
     config = json.loads((run / "config.json").read_text())
-    assert config["arguments"]["steps"] == 6 and config["text_weights"] == "random-seed-0"
+    assert config["arguments"]["steps"] == 6 and config["text weights"] == "random-seed-0"
     assert model.PolicyConfig(**config["config"]) == model.PRESETS["tiny"]
 
     lines = [line for line in metrics(run) if "loss" in line]
