@@ -173,7 +173,10 @@ def own_recordings(folder: str | Path, others: Iterable[str]) -> dict[str, Path]
     if not Path(folder).is_dir():
         raise ValueError(f"there is no folder {folder}: with --suite ml10, experts fill it")
     paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
-    return {} if set(paths) & set(others) else paths
+    known = sorted(set(paths) & set(others))
+    if known and len(known) < len(paths):
+        raise ValueError(f"{folder} mixes your recordings with {known[0]}: move one kind elsewhere")
+    return {} if known else paths
 
 
 def choose_config(

@@ -4,6 +4,7 @@ import functools
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -373,6 +374,11 @@ def test_what_cannot_be_resumed_is_said(run, recorded, tmp_path, capsys):
     assert "another process runs in" in message
     assert "no folder" in fails(train, ["--preset", "tiny", "--data", "misspelt"], capsys)
     assert not Path("misspelt").exists()
+    Path("mixed").mkdir()
+    for name in ("reach", "stir"):
+        shutil.copy(recorded / "reach.npz", f"mixed/{name}.npz")
+    message = fails(train, ["--preset", "tiny", "--data", "mixed"], capsys)
+    assert "mixes your recordings with reach" in message
 
 
 def test_a_run_is_not_resumed_on_other_recordings(recorded, tmp_path, capsys):
