@@ -1,15 +1,16 @@
 """An emulated UR10e with an AG95 gripper on loopback: RTDE, script port, dashboard, Modbus RTU; and
 their faults.
 
-    python -m tests.emulator                # on the real ports, until Ctrl-C: follow the README's
-    robot section with it python -m tests.emulator --hand 2       # and a hand that moves the arm
-    while it is free, for recording
+    python -m tests.emulator                # on the real ports, until Ctrl-C: follow the README
+    python -m tests.emulator --hand 2       # a hand moves the arm while it is free: 2 s a round
 
 It shares no code with robot.py, so that both can be wrong only in different ways;
-`tests/test_robot.py` has `ur-rtde` read it. Emulated are: recipes and their ownership by a
-connection, data packages at the asked frequency, a program that follows input registers (read from
-its text: registers, loop condition, watchdog), first-order motion of the arm, and the gripper's
-registers. Not emulated: kinematics (joints are made up), dynamics, collisions, URScript in general.
+`tests/test_robot.py` has `ur-rtde` read and write it. Emulated are: recipes with their ids and
+their ownership by a connection, data packages at the asked frequency, text messages, a program that
+follows input registers (read from its text: registers, loop condition, watchdog), which takes time
+to start and to brake, first-order motion of the arm with servoj's lookahead time, a script port
+that talks and discards the program of a client that does not listen, and the gripper's registers.
+Not emulated: kinematics (joints are made up), dynamics, collisions, URScript in general.
 """
 
 import argparse
@@ -24,6 +25,7 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 TYPES = {
     "timestamp": "DOUBLE",
@@ -37,14 +39,26 @@ TYPES = {
     "robot_status_bits": "UINT32",
     "safety_status_bits": "UINT32",
     "speed_scaling": "DOUBLE",
+    "target_speed_fraction": "DOUBLE",
+    "tcp_offset": "VECTOR6D",
+    "payload": "DOUBLE",
     **{f"output_int_register_{i}": "INT32" for i in range(48)},
 }
 INPUT_TYPES = {f"input_double_register_{i}": "DOUBLE" for i in range(48)}
 INPUT_TYPES |= {f"input_int_register_{i}": "INT32" for i in range(48)}
-CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "VECTOR6D": "6d"}
+INPUT_TYPES |= {"speed_slider_mask": "UINT32", "speed_slider_fraction": "DOUBLE"}
+INPUT_TYPES |= {
+    f"{kind}_digital_output{part}": "UINT8"
+    for kind in ("standard", "configurable", "tool")
+    for part in ("_mask", "")
+}
+INPUT_TYPES |= {f"standard_analog_output_{part}": "UINT8" for part in ("mask", "type")}
+INPUT_TYPES |= {f"standard_analog_output_{part}": "DOUBLE" for part in (0, 1)}
+CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT8": "B", "VECTOR6D": "6d"}
 START_POSE = (-0.20, -0.55, 0.30, 0.0, 3.0, 0.0)  # metres and axis-angle radians, base frame
 CAMERA = (-0.20, -0.55, 0.90)  # of the scene, metres, base frame
-ARM_SECONDS, GRIPPER_SECONDS = 0.03, 0.1  # time constants of the first-order motion
+GRIPPER_SECONDS, BRAKE_SECONDS = 0.1, 0.03  # time constants
+START_SECONDS, STOPJ_SECONDS = 0.05, 0.12  # of a program, and of its braking
 
 
 @dataclass
@@ -67,7 +81,14 @@ class Faults:
     no_program: bool = False  # programs are taken and not started
     blocked: bool = False  # the arm stands, whatever it is told
     paused: bool = False  # the program is paused at the panel
-    frozen: bool = False  # the same state again and again
+    frozen: bool = False  # the controller's clock stands still
+    backward: bool = False  # the controller's clock runs backwards
+    torn: bool = False  # the program reads one half of a package, and another of the one before
+    scaling: float = 1.0  # the program's motion is slower by this factor
+    slider: float = 1.0  # what the speed slider says
+    remote: str = "true"
+    enabling_bit: bool = False  # a bit of the status that means no stop
+    initializing: float = 0.05  # seconds that the gripper takes to initialize
     gripper_bad_crc: int = 0  # so many answers
     gripper_silent: int = 0
     gripper_exception: int = 0
@@ -94,6 +115,13 @@ class Emulator:
         self.written: dict[str, float] = {}  # when each input was written last
         self.program: dict | None = None
         self.programs: list[str] = []
+        self.messages: list[str] = []  # to all RTDE clients
+        self.told: list[tuple] = []  # every pose that the program has followed
+        self.ends: list[str] = []  # how programs have ended
+        self.previous: dict[str, float] = {}  # the inputs before the newest package
+        self.fastest = [0.0, 0.0]  # the arm, moved by a program: m/s, rad/s
+        self.tcp_offset, self.payload = (0.0, 0.0, 0.17, 0.0, 0.0, 0.0), 1.1
+        self.slave, self.ready_at = 1, 0.0
         self.dashboard_lines: list[str] = []
         self.registers = {0x0100: 0, 0x0101: 50, 0x0103: 1000, 0x0200: 0, 0x0201: 1, 0x0202: 1000}
         self.gripper_frames: list[bytes] = []
@@ -147,95 +175,156 @@ class Emulator:
             time.sleep(max(0.0, due - time.monotonic()))
 
     def step(self, dt: float) -> None:
-        target = None
-        if self.program is not None:
-            target = self.run_program()
+        """The arm follows a program's target, or a hand, or brakes."""
+        target = self.run_program() if self.program is not None else None
+        before = self.pose
         if self.free and self.hand:
             phase = 2 * math.pi * (time.monotonic() - self.began) / self.hand
-            target = [
-                START_POSE[0] + 0.05 * math.sin(phase),
-                *START_POSE[1:2],
-                0.25 + 0.05 * math.cos(phase),
-                *START_POSE[3:],
-            ]
-        share = 1 - math.exp(-dt / ARM_SECONDS)
-        before = list(self.pose)
-        if target is not None and not self.faults.blocked:
-            self.pose = [p + share * (t - p) for p, t in zip(self.pose, target)]
-        self.speed = [(p - b) / dt for p, b in zip(self.pose, before)]
+            x, z = 0.05 * math.sin(phase), 0.05 * math.cos(phase)
+            target = [START_POSE[0] + x, START_POSE[1], 0.25 + z, *START_POSE[3:]]
+        if self.faults.blocked or (self.faults.paused and not self.free):
+            step = np.zeros(6)
+        elif target is not None:
+            seconds = (self.program or {}).get("lookahead", 0.1) / self.faults.scaling
+            seconds = 0.01 if self.free else seconds  # of the hand
+            step = (1 - math.exp(-dt / seconds)) * pose_difference(before, target)
+        else:
+            step = dt * math.exp(-dt / BRAKE_SECONDS) * np.array(self.speed)
+        if step.any():
+            turned = Rotation.from_rotvec(step[3:]) * Rotation.from_rotvec(before[3:])
+            rotvec = turned.as_rotvec() if step[3:].any() else before[3:]
+            self.pose = [*(np.array(before[:3]) + step[:3]).tolist(), *map(float, rotvec)]
+        self.speed = (step / dt).tolist()
+        if not self.free:
+            for part in (0, 1):
+                speed = math.hypot(*self.speed[3 * part : 3 * part + 3])
+                self.fastest[part] = max(self.fastest[part], speed)
         self.opening += (1 - math.exp(-dt / GRIPPER_SECONDS)) * (
             self.registers[0x0103] - self.opening
         )
         self.registers[0x0202] = round(self.opening)
         self.registers[0x0201] = 1 if abs(self.opening - self.registers[0x0103]) < 5 else 0
+        if self.registers[0x0200] == 2 and time.monotonic() > self.ready_at:
+            self.registers[0x0200] = 1
 
     def run_program(self) -> list[float] | None:
-        """One turn of the servo program's loop; None when it has ended."""
-        p = self.program
-        stopped = (
-            self.faults.safety_mode not in (1, 2)
-            or self.faults.robot_mode != 7
-            or self.faults.lose_program
-        )
-        late = (
-            p["watchdog"]
-            and time.monotonic() - self.written.get(p["watchdog"], p["began"]) > 1 / p["hz"]
-        )
-        if p["kind"] == "foreign":
-            self.program = None if stopped else p
+        """One turn of the program's loop: the pose to follow; None when there is none."""
+        p, now = self.program, time.monotonic()
+        if self.faults.safety_mode not in (1, 2) or self.faults.robot_mode != 7:
+            return self.end_program("stopped for safety")
+        if self.faults.lose_program:
+            return self.end_program("no inverse kinematics")
+        if p["kind"] == "foreign" or now < p["begins"]:
             return None
+        if (
+            p["watchdog"]
+            and now - max(self.written.get(p["watchdog"], 0), p["begins"]) > 1 / p["hz"]
+        ):
+            return self.end_program("watchdog")
         if self.faults.paused:
             return None
-        ended = self.inputs[p["while"]] != p["value"]
-        if stopped or late or ended:
-            self.program, self.free = None, False
-            if not stopped and not late:
-                self.outputs[p["state"]] = 0  # the line after the loop
+        if p["braking"]:
+            if now > p["braking"]:
+                self.outputs[p["state"]] = 0  # the line after stopj
+                self.end_program("finished")
             return None
-        self.outputs[p["state"]] = p["value"]
-        self.outputs[p["counter"]] += 1
+        if "old" not in p:  # the first lines
+            self.outputs[p["state"]] = p["value"]
+            if p["counter"]:
+                self.outputs[p["counter"]] = 0
+            p["old"] = None
+        if self.inputs[p["while"]] != p["value"]:
+            p["braking"], self.free = now + STOPJ_SECONDS, False
+            if p["rests"]:
+                p["watchdog"] = None
+            return None
+        inputs = self.inputs
+        if self.faults.torn:  # the newest package has arrived as far as its middle
+            names = list(self.previous)
+            inputs = inputs | {name: self.previous[name] for name in names[len(names) // 2 :]}
+        if p["numbers"] and inputs[p["numbers"][0]] != inputs[p["numbers"][1]]:
+            return p["old"]
+        if p["counter"]:
+            self.outputs[p["counter"]] = inputs[p["numbers"][0]]
         self.free = p["kind"] == "freedrive"
         if self.free:
             return None
-        return [self.inputs[name] for name in p["pose"]]
+        p["old"] = [inputs[name] for name in p["pose"]]
+        self.told.append(tuple(p["old"]))
+        return p["old"]
+
+    def end_program(self, why: str) -> None:
+        """The program is gone; its registers stay as they are."""
+        self.program, self.free = None, False
+        self.ends.append(why)
+        if why not in ("finished", "replaced"):
+            self.messages.append(f"program ended: {why}")
 
     # ---- Script port
 
     def serve_script(self, connection: socket.socket) -> None:
+        """Takes a program when its last line is there, and tells its state all the time."""
+        connection.sendall(struct.pack(">iB", 100, 16) + bytes(95))
         text = b""
-        while part := connection.recv(65536):
+        while not text.endswith(b"\nend\n"):
+            part = connection.recv(65536)
+            if not part:
+                return
             text += part
-        program = text.decode()
+        time.sleep(START_SECONDS / 2)
+        if select.select([connection], [], [], START_SECONDS / 2)[0]:
+            connection.recv(65536)  # of a client that closed without reading this raises an error,
+            if connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+                return  # or leaves one
+        self.load(text.decode())
+        with contextlib.suppress(OSError):
+            while not self.ended.is_set() and not select.select([connection], [], [], 0.1)[0]:
+                connection.sendall(struct.pack(">iB", 100, 16) + bytes(95))
+
+    def load(self, program: str) -> None:
+        def register(pattern: str, name: str) -> str | None:
+            found = re.search(pattern, program)
+            return found and f"{name}_register_{found[1]}"
+
         with self.lock:
             self.programs.append(program)
-            self.program, self.free = None, False
+            if self.program:
+                self.end_program("replaced")
             if self.faults.no_program or not re.match(r"def \w+\(\):\n(  .*\n)+end\n$", program):
                 return
             self.program = {"kind": "foreign", "watchdog": None}
             loop = re.search(r"while read_input_integer_register\((\d+)\) == (\d+):", program)
             pose = re.search(r"p\[(.*)\]", program)
-            servo = pose and "get_inverse_kin(pose" in program and "servoj(q, t=" in program
+            servo = pose and "get_inverse_kin(pose" in program and "servoj(" in program
             free = "  freedrive_mode()\n" in program and "  end_freedrive_mode()\n" in program
-            if loop and (servo or free):
-                watchdog = re.search(r'rtde_set_watchdog\("(\w+)", ([\d.]+), "stop"\)', program)
-                state = re.search(rf"write_output_integer_register\((\d+), {loop[2]}\)", program)
-                counter = re.search(r"write_output_integer_register\((\d+), n\)", program)
-                self.began = time.monotonic()
-                self.outputs[f"output_int_register_{counter[1]}"] = 0
-                self.program = {
-                    "kind": "servo" if servo else "freedrive",
-                    "counter": f"output_int_register_{counter[1]}",
-                    "while": f"input_int_register_{loop[1]}",
-                    "value": int(loop[2]),
-                    "pose": [
-                        f"input_double_register_{n}"
-                        for n in re.findall(r"float_register\((\d+)\)", pose[1] if pose else "")
-                    ],
-                    "watchdog": watchdog and watchdog[1],
-                    "hz": watchdog and float(watchdog[2]),
-                    "state": f"output_int_register_{state[1]}",
-                    "began": time.monotonic(),
-                }
+            if not loop or not (servo or free):
+                self.free = "  freedrive_mode()\n" in program  # until somebody ends it
+                return
+            watchdog = re.search(r'rtde_set_watchdog\("(\w+)", ([\d.]+), "stop"\)', program)
+            lookahead = re.search(r"lookahead_time=([\d.]+)", program)
+            first = register(r"number = read_input_integer_register\((\d+)\)", "input_int")
+            second = register(r"number == read_input_integer_register\((\d+)\)", "input_int")
+            state = rf"write_output_integer_register\((\d+), {loop[2]}\)"
+            self.began = time.monotonic()
+            registers = re.findall(r"float_register\((\d+)\)", pose[1] if pose else "")
+            braking = program.split("  stopj(")[0].rsplit("rtde_set_watchdog", 1)[-1]
+            self.program = {
+                "kind": "servo" if servo else "freedrive",
+                "counter": register(
+                    r"write_output_integer_register\((\d+), number\)", "output_int"
+                ),
+                "while": f"input_int_register_{loop[1]}",
+                "value": int(loop[2]),
+                "pose": [f"input_double_register_{n}" for n in registers],
+                "numbers": (first, second) if first and second else None,
+                "watchdog": watchdog and watchdog[1],
+                "hz": watchdog and float(watchdog[2]),
+                "state": register(state, "output_int"),
+                "lookahead": float(lookahead[1]) if lookahead else 0.1,
+                "rests": '"ignore")' in braking,  # the watchdog, while the arm is braked
+                "begins": self.began + START_SECONDS,
+                "braking": 0.0,
+            }
 
     # ---- Dashboard
 
@@ -250,6 +339,8 @@ class Emulator:
                     "robotmode": f"Robotmode: {modes.get(self.faults.robot_mode, 'UNKNOWN')}",
                     "safetystatus": f"Safetystatus: {safety.get(self.faults.safety_mode, 'FAULT')}",
                     "programState": f"{'PLAYING' if self.program else 'STOPPED'} dami",
+                    "is in remote control": self.faults.remote,
+                    "PolyscopeVersion": "URSoftware 5.15.0.126650 (Sep 10 2023)",
                 }
                 answer = answers.get(line.strip(), f"could not understand: {line.strip()}")
                 connection.sendall(f"{answer}\n".encode())
@@ -260,109 +351,123 @@ class Emulator:
         faults, angle = self.faults, self.pose
         if name in self.outputs:
             return self.outputs[name]
+        clock = time.monotonic() - self.clock
         return {
-            "timestamp": 1.0 if faults.frozen else time.monotonic() - self.clock,
+            "timestamp": 1.0 if faults.frozen else 1e6 - clock if faults.backward else clock,
             "target_q": tuple(angle),
             "actual_q": tuple(angle),  # no kinematics here
             "actual_TCP_pose": tuple(self.pose),
             "actual_TCP_speed": tuple(self.speed),
             "robot_mode": faults.robot_mode,
             "safety_mode": faults.safety_mode,
-            "runtime_state": 4 if self.faults.paused else 2 if self.program else 1,
+            "runtime_state": 1 if not self.program else 4 if self.faults.paused else 2,
             "robot_status_bits": 0b1 | (0b10 if self.program else 0),
-            "safety_status_bits": faults.safety_status_bits,
-            "speed_scaling": 1.0,
+            "safety_status_bits": faults.safety_status_bits | faults.enabling_bit << 11,
+            "speed_scaling": faults.scaling * faults.slider,
+            "target_speed_fraction": faults.slider,
+            "tcp_offset": self.tcp_offset,
+            "payload": self.payload,
         }[name]
 
     def serve_rtde(self, connection: socket.socket) -> None:
-        me, names, frequency, inputs, sending, buffer, due = (
-            id(connection),
-            [],
-            125.0,
-            [],
-            False,
-            b"",
-            0.0,
-        )
+        """One client: one output recipe, up to 255 input recipes, each known by its id."""
+        me, names, frequency, sending, buffer, due = id(connection), [], 125.0, False, b"", 0.0
+        recipes: dict[int, list[str]] = {}
         batch: list[bytes] = []
+        said = len(self.messages)
 
         def send(kind: str, payload: bytes) -> None:
             package = struct.pack(">HB", 3 + len(payload), ord(kind)) + payload
-            if self.faults.one_byte:
-                for byte in package:
-                    connection.sendall(bytes([byte]))
-            else:
-                connection.sendall(package)
+            pieces = [package] if not self.faults.one_byte else [bytes([b]) for b in package]
+            for piece in pieces:
+                connection.sendall(piece)
+
+        def say(text: str, level: int = 0) -> None:
+            source = b"RTDE"
+            lengths = bytes([len(text)]) + text.encode() + bytes([len(source)])
+            send("M", lengths + source + bytes([level]))
 
         def set_up(asked: bytes, types: dict[str, str]) -> tuple[list[str], list[str]]:
             fields = [name for name in asked.decode().split(",") if name]
-            kinds = [
-                "NOT_FOUND" if n in self.faults.not_found else types.get(n, "NOT_FOUND")
-                for n in fields
+            unknown = self.faults.not_found
+            return fields, [
+                "NOT_FOUND" if n in unknown else types.get(n, "NOT_FOUND") for n in fields
             ]
-            return fields, kinds
+
+        def handle(kind: str, payload: bytes) -> bool:
+            """Answers one package; False ends the connection."""
+            nonlocal names, frequency, sending, due
+            if kind == "V":
+                send("V", bytes([payload == b"\0\2" and not self.faults.refuse_version]))
+            elif kind == "v":
+                send("v", struct.pack(">IIII", 5, 15, 0, 0))
+            elif kind == "O":
+                (frequency,) = struct.unpack_from(">d", payload)
+                fields, kinds = set_up(payload[8:], TYPES)
+                valid = bool(fields) and "NOT_FOUND" not in kinds and 1 <= frequency <= 500
+                names = fields if valid else []
+                send("O", bytes([valid]) + ",".join(kinds).encode())
+            elif kind == "I":
+                with self.lock:
+                    fields, kinds = set_up(payload, INPUT_TYPES)
+                    for i, name in enumerate(fields):
+                        if name in self.faults.in_use or self.owners.get(name, me) != me:
+                            kinds[i] = "IN_USE"  # by another client
+                    number = len(recipes) + 1 if all(kind in CODES for kind in kinds) else 0
+                    if number:
+                        recipes[number] = fields
+                        self.owners |= dict.fromkeys(fields, me)
+                send("I", bytes([number]) + ",".join(kinds).encode())
+            elif kind == "S":
+                sending, due = bool(names), time.monotonic()
+                send("S", bytes([sending]))
+            elif kind == "P":
+                sending = False
+                send("P", b"\x01")
+            elif kind == "U":
+                fields = recipes.get(payload[0] if payload else 0)
+                codes = "".join(CODES[INPUT_TYPES[name]] for name in fields or [])
+                layout = struct.Struct(f">B{codes}")
+                if fields is None or layout.size != len(payload):
+                    say("an input package of an unknown recipe, or of a wrong size")
+                    return False
+                self.take(dict(zip(fields, layout.unpack(payload)[1:])))
+            elif kind != "M":
+                say(f"unknown package type {kind}")
+                return False
+            return True
 
         try:
             while not self.ended.is_set() and not self.faults.drop:
-                wait = max(0.0, due - time.monotonic()) if sending else 0.05
-                readable = (
-                    not self.faults.deaf and select.select([connection], [], [], min(wait, 0.05))[0]
-                )
+                wait = min(max(0.0, due - time.monotonic()) if sending else 0.05, 0.05)
                 if self.faults.deaf:
-                    time.sleep(min(wait, 0.05))
-                if readable:
+                    time.sleep(wait)
+                elif select.select([connection], [], [], wait)[0]:
                     part = connection.recv(65536)
                     if not part:
                         return
                     buffer += part
-                while len(buffer) >= 3 and len(buffer) >= (
-                    size := struct.unpack_from(">H", buffer)[0]
-                ):
+                while len(buffer) >= 3:
+                    (size,) = struct.unpack_from(">H", buffer)
+                    if size < 3:
+                        return say(f"a package of {size} bytes")
+                    if len(buffer) < size:
+                        break
                     kind, payload, buffer = chr(buffer[2]), buffer[3:size], buffer[size:]
-                    if kind == "V":
-                        send("V", bytes([not self.faults.refuse_version]))
-                    elif kind == "v":
-                        send("v", struct.pack(">IIII", 5, 15, 0, 0))
-                    elif kind == "O":
-                        frequency = struct.unpack_from(">d", payload)[0]
-                        names, kinds = set_up(payload[8:], TYPES)
-                        send("O", bytes(["NOT_FOUND" not in kinds]) + ",".join(kinds).encode())
-                    elif kind == "I":
-                        with self.lock:
-                            inputs, kinds = set_up(payload, INPUT_TYPES)
-                            for i, name in enumerate(inputs):
-                                if name in self.faults.in_use or self.owners.get(name, me) != me:
-                                    kinds[i] = "IN_USE"
-                            accepted = all(kind in CODES for kind in kinds)
-                            if accepted:
-                                self.owners |= dict.fromkeys(inputs, me)
-                        send("I", bytes([7 if accepted else 0]) + ",".join(kinds).encode())
-                    elif kind == "S":
-                        sending, due = bool(names), time.monotonic()
-                        send("S", bytes([sending]))
-                    elif kind == "P":
-                        sending = False
-                        send("P", b"\x01")
-                    elif kind == "U":
-                        layout = struct.Struct(
-                            ">B" + "".join(CODES[INPUT_TYPES[name]] for name in inputs)
-                        )
-                        _, *values = layout.unpack(payload)
-                        with self.lock:
-                            now = time.monotonic()
-                            self.inputs |= dict(zip(inputs, values))
-                            self.written |= dict.fromkeys(inputs, now)
-                            self.received.append((now, dict(zip(inputs, values))))
+                    if not handle(kind, payload):
+                        return
+                while said < len(self.messages):
+                    said += 1
+                    if sending:
+                        say(self.messages[said - 1], 1)
                 if sending and not self.faults.silent and time.monotonic() >= due:
                     due = max(due + 1 / frequency, time.monotonic() - 1 / frequency)
                     payload = b"\x01"
                     with self.lock:
                         for name in names:
                             value = self.value(name)
-                            payload += struct.pack(
-                                ">" + CODES[TYPES[name]],
-                                *(value if isinstance(value, tuple) else (value,)),
-                            )
+                            values = value if isinstance(value, tuple) else (value,)
+                            payload += struct.pack(">" + CODES[TYPES[name]], *values)
                     if self.faults.garbage:
                         connection.sendall(struct.pack(">HB", 1, ord("U")) + payload)
                         return
@@ -377,6 +482,17 @@ class Emulator:
             with self.lock:
                 self.owners = {name: owner for name, owner in self.owners.items() if owner != me}
 
+    def take(self, values: dict[str, float]) -> None:
+        """Writes the inputs of one package."""
+        with self.lock:
+            now = time.monotonic()
+            self.previous = {name: self.inputs.get(name, 0) for name in values}
+            self.inputs |= values
+            self.written |= dict.fromkeys(values, now)
+            if values.get("speed_slider_mask"):
+                self.faults.slider = values["speed_slider_fraction"]
+            self.received.append((now, values))
+
     # ---- Gripper
 
     def serve_gripper(self, connection: socket.socket) -> None:
@@ -385,7 +501,7 @@ class Emulator:
             buffer += part
             while len(buffer) >= 8:
                 frame, buffer = buffer[:8], buffer[8:]
-                if modbus_crc(frame[:6]) != frame[6:]:
+                if modbus_crc(frame[:6]) != frame[6:] or frame[0] != self.slave:
                     continue  # as a slave does: no answer
                 self.gripper_frames.append(frame)
                 answer = self.answer(frame)
@@ -412,7 +528,8 @@ class Emulator:
             else:
                 self.registers[register] = value
                 if register == 0x0100:
-                    self.registers[0x0200] = 1
+                    self.registers[0x0200] = 2
+                    self.ready_at = time.monotonic() + self.faults.initializing
                 body = frame[:6]
         return body + modbus_crc(body)
 
@@ -433,6 +550,12 @@ def write_scene(path, frames: int = 20) -> None:
         on_top = (abs(x - center) < 0.025) & (abs(y - CAMERA[1]) < 0.025)
         depth[frame] = np.where(on_top, 850, 900)  # millimetres
     np.savez(path, depth=depth, intrinsics=np.array([focal, focal, width / 2, height / 2]))
+
+
+def pose_difference(pose, target) -> np.ndarray:
+    """The step (6,) in metres and radians from one pose to another."""
+    turn = Rotation.from_rotvec(target[3:]) * Rotation.from_rotvec(pose[3:]).inv()
+    return np.concatenate([np.subtract(target[:3], pose[:3]), turn.as_rotvec()])
 
 
 def modbus_crc(data: bytes) -> bytes:

@@ -3,10 +3,13 @@
 import asyncio
 import contextlib
 import ctypes
+import functools
 import json
 import os
+import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -20,12 +23,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
+import clip
 import data
 import model
 import robot
 import scripts
 from robot import RTDE, Gripper, RobotError, Servo, Settings
 from tests.emulator import START_POSE, Emulator, write_scene
+from tests.fuzz_robot import fuzz_robot
 
 ROOT = Path(__file__).parents[1]
 CAMERA_TO_BASE = [[1, 0, 0, -0.2], [0, -1, 0, -0.55], [0, 0, -1, 0.9], [0, 0, 0, 1]]
@@ -48,7 +53,7 @@ def emulator():
 @pytest.fixture
 def settings(emulator):
     ports = {f"{name}_port": port for name, port in emulator.ports.items()}
-    return Settings(**BOXES, **ports, num_points=64, max_hold_s=0.5)
+    return Settings(**BOXES, **ports, num_points=64, max_hold_s=0.5, max_state_age_s=0.25)
 
 
 def connect(settings, write=True):
@@ -96,11 +101,11 @@ def stops(servo, seconds=2.0):
 
 def assert_stop_is_last(emulator):
     """A stop was sent once, and nothing after it."""
-    time.sleep(0.1)
+    time.sleep(0.04)
     commands = [fields["input_int_register_24"] for _, fields in emulator.received]
     assert commands and commands[-1] == robot.STOP and robot.STOP not in commands[:-1]
     count = len(commands)
-    time.sleep(0.1)
+    time.sleep(0.04)
     assert len(emulator.received) == count
 
 
@@ -126,8 +131,8 @@ def test_the_state_is_read_whole_however_the_bytes_arrive(emulator, settings):
 
 
 def test_what_the_controller_refuses_is_named(emulator, settings):
-    emulator.faults.not_found = {"actual_TCP_speed"}
-    with pytest.raises(RobotError, match="actual_TCP_speed is NOT_FOUND"):
+    emulator.faults.not_found = {"payload"}
+    with pytest.raises(RobotError, match="payload is NOT_FOUND"):
         connect(settings)
     emulator.faults.not_found, emulator.faults.in_use = set(), {"input_double_register_26"}
     with pytest.raises(RobotError, match=r"input_double_register_26 is IN_USE .*another client"):
@@ -163,37 +168,108 @@ def test_nobody_listening_is_one_line(settings):
         assert str(port) in str(caught.value) and "\n" not in str(caught.value)
 
 
-UR_RTDE = """import json, sys, time, rtde_receive
+UR_RTDE = """import json, sys, time, rtde_receive, rtde_io, dashboard_client
 r = rtde_receive.RTDEReceiveInterface("127.0.0.1", 125.0, json.loads(sys.argv[1]))
+r.startFileRecording("recorded.csv", ["timestamp", "payload"])
 time.sleep(0.2)
 print(json.dumps({
-    "actual_TCP_pose": r.getActualTCPPose(), "actual_q": r.getActualQ(),
-    "actual_TCP_speed": r.getActualTCPSpeed(), "timestamp": r.getTimestamp(),
-    "robot_mode": r.getRobotMode(), "safety_mode": r.getSafetyMode(),
+    "actual_TCP_pose": r.getActualTCPPose(), "timestamp": r.getTimestamp(),
+    "robot_mode": r.getRobotMode(), "safety_mode": r.getSafetyMode(), "payload": r.getPayload(),
     "runtime_state": r.getRuntimeState(), "robot_status_bits": r.getRobotStatus(),
     "safety_status_bits": r.getSafetyStatusBits(),
+    "target_speed_fraction": r.getTargetSpeedFraction(),
 }))
+r.stopFileRecording()
+io = rtde_io.RTDEIOInterface("127.0.0.1")  # a control loop with a recipe for each kind of input
+for turn in range(5):
+    assert io.setInputDoubleRegister(18, turn / 4) and io.setInputIntRegister(19, turn)
+assert io.setSpeedSlider(0.5)
+time.sleep(0.1)
+print(r.getTargetSpeedFraction())
+dashboard = dashboard_client.DashboardClient("127.0.0.1")
+dashboard.connect()
+print(dashboard.isInRemoteControl())
 """  # in a process of its own, since it holds Python's lock while it waits for an answer
 
 
-def test_ur_rtde_reads_the_emulator_and_agrees_with_our_client():
+def test_ur_rtde_reads_writes_and_records_the_emulator_and_agrees_with_our_client(tmp_path):
     pytest.importorskip("rtde_receive", reason="ur-rtde has wheels for some platforms only")
-    names = [name for name in robot.OUTPUTS if not name.startswith("output_int_register")]
-    with Emulator(rtde=30004) as emulator:  # the port that ur-rtde knows
+    others = ("output_int_register_24", "output_int_register_25", "tcp_offset")
+    names = [name for name in robot.OUTPUTS if name not in others]
+    with Emulator(rtde=30004, dashboard=29999) as emulator:  # the ports that ur-rtde knows
         emulator.faults.safety_mode, emulator.faults.safety_status_bits = 2, 0b10
-        command = [sys.executable, "-c", UR_RTDE, json.dumps(names)]
-        theirs = json.loads(
-            subprocess.run(command, capture_output=True, check=True, timeout=20).stdout
-        )
         ours = RTDE("127.0.0.1", 30004)
         v = ours.state().values
         ours.close()
-    assert (
-        set(theirs) == set(names) and v["safety_mode"] == 2 and v["actual_TCP_pose"] == START_POSE
-    )
-    assert 0 <= v["timestamp"] - theirs.pop("timestamp") < 10
+        command = [sys.executable, "-c", UR_RTDE, json.dumps(names)]
+        done = subprocess.run(
+            command, capture_output=True, check=True, timeout=20, text=True, cwd=tmp_path
+        )
+        read, slider, remote = done.stdout.splitlines()
+        inputs = emulator.inputs
+    theirs = json.loads(read)
+    assert set(theirs) == set(names) and v["safety_mode"] == 2
+    assert 0 <= theirs.pop("timestamp") - v["timestamp"] < 10
     for name, value in theirs.items():
         np.testing.assert_allclose(value, v[name], err_msg=name)
+    recorded = (tmp_path / "recorded.csv").read_text().splitlines()
+    assert len(recorded) > 10 and float(recorded[-1].split(",")[1]) == emulator.payload
+    assert (inputs["input_double_register_18"], inputs["input_int_register_19"]) == (1.0, 4)
+    assert (float(slider), remote) == (0.5, "True")
+
+
+def raw(emulator, *packages):
+    """The answers of the emulator to packages (type, payload), as (type, payload)."""
+    with socket.create_connection(("127.0.0.1", emulator.ports["rtde"])) as connection:
+        connection.settimeout(2)
+        for kind, payload in packages:
+            size = 3 + len(payload) if kind != "0" else 0
+            connection.sendall(struct.pack(">HB", size, ord(kind.replace("0", "V"))) + payload)
+        connection.shutdown(socket.SHUT_WR)
+        received = b""
+        with contextlib.suppress(ConnectionResetError):
+            while len(received) < 1000 and (part := connection.recv(4096)):
+                received += part
+    answers = []
+    while received:
+        (size,) = struct.unpack_from(">H", received)
+        answers.append((chr(received[2]), received[3:size]))
+        received = received[size:]
+    return answers
+
+
+@pytest.mark.parametrize(
+    "packages, answers",
+    [
+        ([("V", b"\0\1")], [("V", b"\0")]),
+        ([("S", b"")], [("S", b"\0")]),  # nothing to send
+        ([("O", struct.pack(">d", 0) + b"payload")], [("O", b"\0DOUBLE")]),
+        ([("O", struct.pack(">d", 9) + b"no"), ("S", b"")], [("O", b"\0NOT_FOUND"), ("S", b"\0")]),
+        (
+            [("I", b"input_int_register_0"), ("I", b"speed_slider_mask")],
+            [("I", b"\1INT32"), ("I", b"\2UINT32")],
+        ),
+        ([("I", b"input_int_register_0"), ("U", b"\2\0\0\0\1")], [("I", b"\1INT32"), ("M", None)]),
+        ([("0", b"")], [("M", None)]),
+        ([("Z", b"")], [("M", None)]),
+    ],
+)
+def test_the_emulator_is_as_strict_as_the_controller(emulator, packages, answers):
+    found = raw(emulator, *packages)
+    assert [kind for kind, _ in found] == [kind for kind, _ in answers]
+    assert all(payload in (None, got) for (_, payload), (_, got) in zip(answers, found))
+
+
+def test_the_program_of_a_client_that_does_not_read_is_discarded(emulator, settings):
+    program = "def other():\n  sleep(9)\nend\n"
+    with socket.create_connection(("127.0.0.1", settings.script_port)) as connection:
+        time.sleep(0.05)  # the controller has said something
+        connection.sendall(program.encode())
+    time.sleep(0.2)
+    assert emulator.programs == []
+    robot.upload("127.0.0.1", settings.script_port, program)
+    time.sleep(0.2)
+    assert emulator.programs == [program]
 
 
 # ---- Geometry ------------------------------------------------------------------------------------
@@ -221,15 +297,14 @@ def test_interpolation_is_straight_and_scipys_slerp():
         pose, target = rng.normal(size=6), rng.normal(size=6)
         step = robot.difference(pose, target)
         share = 0.3
-        reached = robot.toward(
-            pose, target, share * np.linalg.norm(step[:3]), share * np.linalg.norm(step[3:])
-        )
+        reached = robot.toward(pose, target, share * robot.lengths(step))
         np.testing.assert_allclose(reached[:3], pose[:3] + share * (target - pose)[:3])
         slerp = Slerp([0, 1], Rotation.from_rotvec([pose[3:], target[3:]]))
         np.testing.assert_allclose(
             (Rotation.from_rotvec(reached[3:]) * slerp(share).inv()).magnitude(), 0, atol=1e-7
         )
-    np.testing.assert_allclose(robot.toward(pose, target, 100, 100)[:3], target[:3])
+    np.testing.assert_allclose(robot.toward(pose, target, np.array([100, 100]))[:3], target[:3])
+    assert robot.toward(pose, pose, np.array([0.1, 0.1])) == pytest.approx(pose)
 
 
 # ---- Motion --------------------------------------------------------------------------------------
@@ -289,9 +364,11 @@ def test_the_actual_pose_is_there_before_the_program_starts_and_speeds_stay_in_t
     [
         (np.full((8, 7), np.nan), "not finite"),
         (np.zeros((8, 4)), r"shape \(8, 4\)"),
+        (np.zeros((0, 7)), r"shape \(0, 7\)"),
+        (np.zeros(7), r"shape \(7,\)"),
         (steps(dx=0.2), "jumps by 0.200 m"),
         (steps(drx=0.5), "0.500 rad"),
-        (steps(dz=-0.04), "outside the box"),
+        (steps(dz=-0.04), "outside its box"),
     ],
 )
 def test_a_bad_action_stops_the_arm(emulator, settings, actions, message):
@@ -302,54 +379,58 @@ def test_a_bad_action_stops_the_arm(emulator, settings, actions, message):
             servo.follow(actions)
         with pytest.raises(RobotError, match=message):  # and never goes on
             servo.follow(STILL)
-        time.sleep(0.2)
+        time.sleep(0.1)
         np.testing.assert_allclose(emulator.pose, before, atol=1e-3)
     assert_stop_is_last(emulator)
 
 
 def test_a_target_outside_the_box_is_clamped_if_asked(emulator, settings):
+    emulator.pose[2] = 0.08
     with Moving(replace(settings, outside_box="clamp")) as servo:
+        servo.go(np.array([*START_POSE[:2], 0.07, *START_POSE[3:]]))
         servo.follow(steps(dz=-0.04))
-        time.sleep(1.4)
+        time.sleep(0.3)
         servo.check()
-        assert (
-            servo.clamped
-            and min(pose["input_double_register_26"] for _, pose in emulator.received) >= 0.05
-        )
+        heights = [pose["input_double_register_26"] for _, pose in emulator.received]
+        assert servo.clamped and 0.05 <= min(heights) < 0.051
     assert_stop_is_last(emulator)
 
 
 @pytest.mark.parametrize(
     "fault, message",
     [
-        ({"silent": True}, "the newest state is 0.1"),
+        ({"silent": True}, "the newest state is 0."),
         ({"drop": True}, "connection"),
         ({"garbage": True}, "framing lost"),
         ({"safety_mode": 3, "safety_status_bits": 0b100}, "safety: protective stop"),
         ({"safety_status_bits": 1 << 7}, "safety"),
         ({"robot_mode": 5}, "not running"),
-        ({"lose_program": True}, "the program on the controller has ended"),
+        ({"lose_program": True}, "the controller said: program ended: no inverse kinematics"),
         ({"deaf": True}, "the program on the controller has ended"),  # its watchdog
+        ({"slider": 0.5}, "the speed slider is at 50%"),
+        ({"scaling": 0.01}, "slowed down"),
+        ({"torn": True}, "our program stands still"),  # no pose is read whole
+        ({"backward": True}, "the controller's clock runs backwards"),
         ({"paused": True}, "is paused"),
         ({"blocked": True}, "m, 0.000 rad behind: blocked"),
-        ({"frozen": True}, "the controller's clock"),
+        ({"frozen": True}, "the controller's clock stands still"),
     ],
 )
 def test_trouble_with_the_controller_stops_the_arm_for_good(emulator, settings, fault, message):
     with Moving(replace(settings, max_hold_s=10)) as servo:
-        servo.follow(steps(dx=0.01))
-        time.sleep(0.1)
+        servo.follow(steps(dx=0.005))
+        time.sleep(0.05)
         for name, value in fault.items():
             setattr(emulator.faults, name, value)
         assert message in stops(servo)
-        time.sleep(0.1)
-        count = len(emulator.received)
+        count = len(emulator.received) + (0 if "deaf" in fault else 1)  # and the stop
         emulator.faults = type(emulator.faults)()  # all is well again, but the arm stays stopped
         with pytest.raises(RobotError, match=message):
             servo.follow(STILL)
-        time.sleep(0.2)
+        time.sleep(0.05)
         later = [fields["input_int_register_24"] for _, fields in emulator.received[count:]]
         assert not any(later) or "deaf" in fault  # what the deaf one had not read
+    assert_within_limits(emulator, settings)
     assert not any(
         line.startswith(("unlock", "power", "brake", "play")) for line in emulator.dashboard_lines
     )
@@ -368,67 +449,107 @@ def test_a_late_policy_holds_the_arm_then_stops_it(emulator, settings):
     assert_stop_is_last(emulator)
 
 
-def test_a_robot_in_trouble_is_not_moved_at_all(emulator, settings):
+def test_a_robot_in_trouble_is_not_moved_at_all(emulator, settings, monkeypatch):
     emulator.faults.safety_mode = 3
     with pytest.raises(RobotError, match="protective stop"):
         Moving(settings).__enter__()
     assert emulator.received == []
-    time.sleep(0.2)
     emulator.faults.safety_mode, emulator.faults.no_program = 1, True
+    monkeypatch.setattr(Servo, "PATIENCE", 0.3)
     with pytest.raises(RobotError, match="does not start"):
         Moving(settings).__enter__()
     (program,) = emulator.programs
-    assert robot.servo_turn(settings) in program and 'rtde_set_watchdog("input_int' in program
+    assert "servoj(get_inverse_kin(pose, get_actual_joint_positions()), t=0.0080, " in program
     emulator.faults.no_program = False
     emulator.pose[0] = 0.25
+    time.sleep(0.05)
     with pytest.raises(RobotError, match=r"outside its box, at 0\.250, -0\.550"):
         Moving(settings).__enter__()
     emulator.pose[0] = float("nan")
+    time.sleep(0.05)
     with pytest.raises(RobotError, match="not finite"):
         Moving(settings).__enter__()
 
 
-def speeds(emulator, seconds):
-    """The emulated arm's speeds in m/s, as long as asked."""
-    found, until = [], time.monotonic() + seconds
-    while time.monotonic() < until:
-        found.append(np.linalg.norm(emulator.speed[:3]))
-        time.sleep(0.001)
-    return max(found)
+# ---- Dangers: nothing jumps, nothing stays free, nobody else's program is taken for ours ---------
+
+
+def assert_within_limits(emulator, settings):
+    """The arm has never been faster than allowed."""
+    assert emulator.fastest[0] <= settings.max_speed_m_s
+    assert emulator.fastest[1] <= settings.max_speed_rad_s
 
 
 def test_an_arm_that_was_moved_before_the_start_does_not_jump_back(emulator, settings):
     moving = Moving(settings)
-    emulator.pose[1] += 0.12  # while the gripper initializes
+    moving.rtde = connect(settings)
+    moving.servo = Servo(moving.rtde, settings)  # as `run`, before the gripper initializes
+    emulator.pose[1] += 0.12
     time.sleep(0.05)
-    with moving as servo:
-        servo.follow(steps(dx=0.01))
-        assert speeds(emulator, 0.5) < 1.2 * settings.max_speed_m_s
-        servo.check()
+    moving.servo.start("127.0.0.1")
+    moving.servo.follow(steps(dx=0.01))
+    time.sleep(0.3)
+    moving.servo.check()
+    moving.__exit__()
+    assert_within_limits(emulator, settings)
+    assert emulator.pose[1] == pytest.approx(START_POSE[1] + 0.12, abs=1e-3)
+
+
+@pytest.mark.parametrize("fault", [{"blocked": True}, {"scaling": 0.01}])
+def test_an_arm_that_was_held_back_does_not_leap_when_it_goes_on(emulator, settings, fault):
+    with Moving(replace(settings, max_hold_s=10)) as servo:
+        for actions, seconds in ((steps(drz=0.0125), 0.3), (steps(dx=0.024, drz=0.015), 0.5)):
+            servo.check()  # for a short time it is held back only
+            servo.follow(actions)
+            time.sleep(0.2)
+            for name, value in fault.items():
+                setattr(emulator.faults, name, value)
+            time.sleep(seconds)
+            emulator.faults = type(emulator.faults)()
+            time.sleep(0.1)
+        assert servo.error is not None  # it was long enough at last
+    assert_within_limits(emulator, settings)
+    assert emulator.fastest[0] > 0.5 * settings.max_speed_m_s
 
 
 def test_an_arm_that_was_paused_does_not_leap_when_it_goes_on(emulator, settings):
     with Moving(replace(settings, max_hold_s=10)) as servo:
-        servo.follow(steps(dx=0.02))
-        time.sleep(0.1)
+        servo.follow(steps(dx=0.024, drz=0.015))
+        time.sleep(0.2)
         emulator.faults.paused = True
         assert "is paused" in stops(servo)
         emulator.faults.paused = False
-        assert speeds(emulator, 0.4) < 1.2 * settings.max_speed_m_s
+        time.sleep(0.2)
+    assert_within_limits(emulator, settings)
 
 
-def test_a_program_that_is_not_ours_is_not_followed_by_more_targets(emulator, settings):
+def test_a_program_that_is_not_ours_is_not_followed_by_more_targets(
+    emulator, settings, monkeypatch
+):
     with Moving(replace(settings, max_hold_s=10)) as servo:
-        servo.follow(steps(dx=0.01))
+        servo.follow(steps(dx=0.005))
         time.sleep(0.1)
-        upload = robot.upload
-        upload("127.0.0.1", settings.script_port, "def other():\n  sleep(9)\nend\n")
-        assert "the count of our program stands still" in stops(servo)
+        program = "def other():\n  sleep(9)\nend\n"
+        robot.upload("127.0.0.1", settings.script_port, program)
+        while program not in emulator.programs:
+            time.sleep(0.01)
+        count = len(emulator.received)
+        assert "our program stands still" in stops(servo)
+        assert len(emulator.received) - count < settings.servo_hz
     # What a killed process left in the registers is not taken for a program of ours.
     emulator.faults.no_program = True
     emulator.outputs["output_int_register_24"] = 1
+    monkeypatch.setattr(Servo, "PATIENCE", 0.3)
     with pytest.raises(RobotError, match="does not start"):
         Moving(settings).__enter__()
+
+
+@pytest.mark.parametrize("where", [(0.43, -0.55, 0.3), (-0.2, -0.55, 0.82)])
+def test_an_arm_that_begins_outside_the_box_is_not_pulled_inside(emulator, settings, where):
+    emulator.pose[:3] = where
+    with pytest.raises(RobotError, match="outside its box"):
+        Moving(replace(settings, outside_box="clamp")).__enter__()
+    assert emulator.told == [] and emulator.pose[:3] == list(where)
 
 
 def test_the_rotation_vector_does_not_flip_for_a_tool_that_points_down(emulator, settings):
@@ -445,34 +566,50 @@ def test_the_rotation_vector_does_not_flip_for_a_tool_that_points_down(emulator,
     assert np.linalg.norm(sent[-1]) > np.pi
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_no_script_of_faults_makes_the_arm_fast(emulator, settings, seed):
-    """Faults that come and go at random while the policy asks for all it may."""
-    rng = np.random.default_rng(seed)
-    names = ["blocked", "paused", "frozen", "silent", "deaf", "lose_program"]
-    fastest = 0.0
+def test_the_program_follows_no_pose_of_which_it_has_read_only_half(emulator, settings):
     with Moving(replace(settings, max_hold_s=10)) as servo:
-        for _ in range(8):
-            with contextlib.suppress(RobotError):
-                servo.follow(rng.uniform(-0.04, 0.04, size=(8, 7)) * (np.arange(7) < 3))
-            name = names[rng.integers(len(names))]
-            setattr(emulator.faults, name, True)
-            fastest = max(fastest, speeds(emulator, rng.uniform(0.01, 0.1)))
-            setattr(emulator.faults, name, False)
-            fastest = max(fastest, speeds(emulator, 0.05))
-    assert fastest < 1.25 * settings.max_speed_m_s, fastest
+        servo.follow(steps(dx=0.01, drz=0.01))
+        for _ in range(5):
+            time.sleep(0.03)
+            emulator.faults.torn = not emulator.faults.torn
+    names = [f"input_double_register_{24 + i}" for i in range(6)]
+    sent = {tuple(fields[name] for name in names) for _, fields in emulator.received}
+    assert len(set(emulator.told)) > 5 and set(emulator.told) <= sent
+
+
+def test_braking_is_not_cut_short_by_the_watchdog(emulator, settings):
+    with Moving(settings) as servo:
+        servo.follow(steps(dx=0.02))
+        time.sleep(0.3)
+    assert emulator.ends == ["finished"]
+
+
+def test_a_program_that_does_not_end_is_told(emulator, settings, capsys):
+    with Moving(settings):
+        emulator.faults.paused = True
+        emulator.inputs["input_int_register_24"] = -1
+        emulator.take = lambda values: None  # what is sent now is lost
+        emulator.faults.paused = False
+        emulator.run_program = lambda: None
+    assert "does not end: stop it by hand" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_script_of_faults_makes_the_arm_faster_than_allowed(seed):
+    fastest, limits, _ = fuzz_robot(seed)
+    assert fastest[0] <= limits[0] and fastest[1] <= limits[1]
 
 
 def test_inference_does_not_hold_up_the_stream(emulator, settings):
     with Moving(replace(settings, max_hold_s=5)) as servo:
         a = torch.randn(600, 600)
-        until = time.monotonic() + 1.0
+        until = time.monotonic() + 0.6
         while time.monotonic() < until:
             a = torch.tanh(a @ a)
         servo.check()
         times = np.array([when for when, _ in emulator.received])
     assert (
-        len(times) > 60 and np.diff(times).max() < 0.1
+        len(times) > 30 and np.diff(times).max() < 0.1
     )  # the watchdog's limit is 0.08 s on average
 
 
@@ -488,6 +625,16 @@ def test_the_gripper_initializes_moves_and_tells_where_it_is(emulator, settings)
     time.sleep(0.8)
     assert gripper.read() == pytest.approx(1.0, abs=0.01)
     assert [frame[:6].hex() for frame in emulator.gripper_frames].count("010601030000") == 1
+    gripper.close()
+
+
+def test_another_address_and_a_gripper_that_opens_the_other_way_are_settings(emulator, settings):
+    emulator.slave = 9
+    other = replace(settings, gripper_slave=9, gripper_open_at=0)
+    gripper = Gripper(other, "127.0.0.1", timeout=0.1)
+    assert gripper.read() == pytest.approx(1.0)
+    gripper.move(0.0)
+    assert emulator.registers[0x0103] == 0
     gripper.close()
 
 
@@ -553,7 +700,8 @@ def test_pymodbus_understands_our_frames():
 def test_depth_becomes_the_points_of_the_analytic_scene(tmp_path):
     write_scene(tmp_path / "scene.npz")
     camera = robot.RecordedCamera(tmp_path / "scene.npz")
-    points = robot.cloud(camera.read(), camera.intrinsics, Settings(**BOXES, num_points=400))
+    points, seen = robot.cloud(camera.read(), camera.intrinsics, Settings(**BOXES, num_points=400))
+    assert 12000 < seen < 120 * 160
     assert points.shape == (400, 3) and points.dtype == np.float32
     table, top = abs(points[:, 2]) < 2e-3, abs(points[:, 2] - 0.05) < 2e-3
     assert (table | top).all() and top.sum() > 3
@@ -563,7 +711,7 @@ def test_depth_becomes_the_points_of_the_analytic_scene(tmp_path):
 
 
 def test_missing_depth_and_an_empty_crop_are_refused_and_few_points_repeated():
-    settings, intrinsics = Settings(**BOXES, num_points=100), robot.Intrinsics(100, 100, 2, 2)
+    settings, intrinsics = Settings(**BOXES, num_points=100), (100, 100, 2, 2)
     with pytest.raises(RobotError, match="depth is empty"):
         robot.cloud(np.zeros((4, 4), np.float32), intrinsics, settings)
     with pytest.raises(RobotError, match="crop box"):
@@ -571,22 +719,23 @@ def test_missing_depth_and_an_empty_crop_are_refused_and_few_points_repeated():
     depth = np.zeros((4, 4), np.float32)
     depth[1, 1] = depth[2, 3] = 0.9
     depth[3, 3] = np.nan
-    points = robot.cloud(depth, intrinsics, settings)
+    points, seen = robot.cloud(depth, intrinsics, settings)
+    assert seen == 2
     assert points.shape == (100, 3) and len(np.unique(points, axis=0)) == 2
 
 
 def test_a_large_depth_image_is_thinned_out_before_it_is_sampled(monkeypatch):
-    sizes, sample = [], robot.farthest_point_sample
+    sizes, sample = [], data.farthest_point_sample
     monkeypatch.setattr(
-        robot,
+        data,
         "farthest_point_sample",
         lambda points, n: sizes.append(len(points)) or sample(points, n),
     )
     rows, columns = np.mgrid[:480, :640]
     depth = (0.7 + 0.0002 * rows + 0.0001 * columns).astype(np.float32)
     settings = Settings(**BOXES | {"camera_to_base": CAMERA_TO_BASE}, num_points=256)
-    points = robot.cloud(depth, robot.Intrinsics(600.0, 600.0, 320.0, 240.0), settings)
-    everything = robot.cloud(depth[::8, ::8], robot.Intrinsics(75.0, 75.0, 40.0, 30.0), settings)
+    points, _ = robot.cloud(depth, (600.0, 600.0, 320.0, 240.0), settings)
+    everything, _ = robot.cloud(depth[::8, ::8], (75.0, 75.0, 40.0, 30.0), settings)
     assert sizes[0] <= robot.SAMPLED_FROM < depth.size
     np.testing.assert_allclose(points.min(0), everything.min(0), atol=0.02)
     np.testing.assert_allclose(points.max(0), everything.max(0), atol=0.02)
@@ -652,21 +801,49 @@ def test_the_librealsense_library_delivers_synthetic_depth():
     sensor.close()
 
 
+def test_frames_without_depth_are_no_traceback():
+    camera = object.__new__(robot.RealSense)
+    empty = type("Empty", (), {"__bool__": lambda self: False})()
+    frames = type("Frames", (), {"get_depth_frame": lambda self: empty})()
+    camera.pipeline = type("Pipeline", (), {"wait_for_frames": lambda self, ms: frames})()
+    with pytest.raises(robot.CameraError, match="without depth"):
+        camera.read()
+
+
 # ---- Settings ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"tcp_low_m": [0.5, -0.9, 0.05]}, "tcp_low_m"),
-        ({"crop_low_m": [0, 0]}, "three numbers in metres"),
+        ({"tcp_low_m": [0.5, -0.9, 0.05]}, "must be below that of tcp_high_m"),
+        ({"crop_low_m": [0, 0]}, "give 3 of float or int"),
+        ({"crop_low_m": [0, "0", 0]}, "give 3 of float or int"),
+        ({"crop_low_m": [0, True, 0]}, "give 3 of float or int"),
+        ({"tcp_high_m": None}, "give 3 of float or int"),
+        ({"tcp_low_m": [-600, -900, 50]}, "use -5"),  # millimetres
+        ({"rotation_near_rad": [0, 180, 0]}, "use -5"),  # degrees
+        ({"start_pose": [0, 0, 0.3]}, "give 6 of float or int"),
+        ({"start_pose": [-0.2, -0.5, 0.9, 0, 3, 0]}, "start_pose .*outside its box"),
         ({"camera_to_base": [[1, 0, 0, 0]] * 4}, "must be a rotation"),
-        ({"max_speed": 1.0}, "unknown max_speed"),
-        ({"max_speed_m_s": 5.0}, "at most 1.0"),
-        ({"max_speed_m_s": "fast"}, "must be of type float"),
+        ({"camera_to_base": [[1, 0, 0, 0]] * 3}, "give 4 x 4 of float or int"),
+        ({"camera_to_base": [[1, 0, 0, 0], [1]] * 2}, "give 4 x 4 of float or int"),
+        ({"max_speed": 1.0}, "unexpected keyword argument 'max_speed'"),
+        ({"max_speed_m_s": 5.0}, "max_speed_m_s .* to 1"),
+        ({"max_speed_m_s": True}, "give 1 of float or int"),
+        ({"max_speed_m_s": "fast"}, "give 1 of float or int"),
+        ({"max_speed_m_s": float("nan")}, "use 0.001 to"),
+        ({"max_speed_rad_s": 9}, "to 3"),  # degrees
+        ({"max_step_m": 50}, "to 0.5"),
+        ({"servo_hz": 5}, "servo_hz .*use 100"),  # a watchdog of 0.5 Hz
         ({"servo_gain": 5}, "100 to 2000"),
-        ({"outside_box": "ignore"}, 'use "stop" or "clamp"'),
-        ({"tcp_high_m": None}, "three numbers in metres"),
+        ({"num_points": 64.0}, "give 1 of int"),
+        ({"num_points": True}, "give 1 of int"),
+        ({"outside_box": "ignore"}, "'stop', 'clamp'"),
+        ({"outside_box": ["stop"]}, "give 1 of str"),
+        ({"gripper_open_at": 500}, "0, 1000"),
+        ({"gripper_slave": 0}, "1 to 247"),
+        ({"gripper_serial": 7}, "give 1 of str"),
     ],
 )
 def test_wrong_settings_are_refused_in_one_line(tmp_path, changes, message):
@@ -675,11 +852,15 @@ def test_wrong_settings_are_refused_in_one_line(tmp_path, changes, message):
     with pytest.raises(ValueError, match=message) as caught:
         robot.load_settings(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_holds_no_settings_is_refused_in_one_line(tmp_path):
+    path = tmp_path / "robot.json"
     path.write_text("{")
-    with pytest.raises(ValueError, match="not JSON"):
+    with pytest.raises(ValueError, match="Expecting property name"):
         robot.load_settings(path)
     path.write_text(json.dumps({name: BOXES[name] for name in BOXES if name != "camera_to_base"}))
-    with pytest.raises(ValueError, match="lacks camera_to_base"):
+    with pytest.raises(ValueError, match=r"missing 1 required .*camera_to_base"):
         robot.load_settings(path)
 
 
@@ -694,15 +875,19 @@ def test_the_example_settings_are_valid():
 def cell(emulator, tmp_path, monkeypatch):
     """A folder with robot.json and scene.npz for the emulator, and arguments that name them."""
     monkeypatch.chdir(tmp_path)
+    threads = torch.get_num_threads()
     ports = {f"{name}_port": port for name, port in emulator.ports.items()}
-    Path("robot.json").write_text(json.dumps(BOXES | ports | {"num_points": 64, "policy_hz": 20}))
+    Path("robot.json").write_text(
+        json.dumps(BOXES | ports | {"num_points": 64, "policy_hz": 20, "max_state_age_s": 0.25})
+    )
     write_scene("scene.npz")
-    return ["--host", "127.0.0.1", "--camera", "scene.npz"]
+    yield ["--host", "127.0.0.1", "--camera", "scene.npz"]
+    torch.set_num_threads(threads)
 
 
 def is_held(emulator):
-    """Whether the arm was free, and soon no longer is."""
-    time.sleep(0.3)
+    """Whether the arm was free, and no longer is."""
+    time.sleep(0.02)
     return "  freedrive_mode()" in emulator.programs[-1] and not emulator.free
 
 
@@ -725,72 +910,176 @@ class Typing:
         self.thread.start()
 
     def type(self, writing, keys):
-        for seconds, key in keys:
-            time.sleep(seconds)
-            os.write(writing, f"{key}\n".encode())
+        with contextlib.suppress(BrokenPipeError):  # nobody reads any more
+            for seconds, key in keys:
+                time.sleep(seconds)
+                os.write(writing, f"{key}\n".encode())
 
 
-def record(cell, episodes):
-    return [
-        "record",
-        *cell,
-        "--task",
-        "stack-cube",
-        "--instruction",
-        "Stack the cube.",
-        "--episodes",
-        str(episodes),
-    ]
+def record(cell, episodes, *more):
+    task = ["--task", "stack-cube", "--instruction", "Stack the cube."]
+    return ["record", *cell, *task, "--episodes", str(episodes), *more]
+
+
+EPISODE = ((0.2, "s"), (0.3, "e"))
 
 
 def test_check_reports_everything_and_moves_nothing(emulator, cell, capsys):
-    assert ends(["check", *cell]) == 0
+    emulator.faults.enabling_bit = True  # means no stop
+    assert ends(["check", *cell, "--picture", "cell.png"]) == 0
     printed = capsys.readouterr().out
     for part in (
         "Robotmode: RUNNING",
         "Safetystatus: NORMAL",
+        "is in remote control  true",
         "ready",
-        "gripper",
-        "64, from",
+        "'payload_kg': 1.1",
+        "0.00 (0 open, 1 closed)",
+        "13625 of 19200 in the crop box",
         "-0.200 -0.550 0.300",
     ):
-        assert part in printed
-    emulator.faults.safety_mode = 3
-    assert ends(["check", *cell]) == 2
-    assert "protective stop" in capsys.readouterr().err
+        assert part in printed, part
+    assert Path("cell.png").read_bytes().startswith(b"\x89PNG")
+    for faults, message in (
+        ({"safety_mode": 3}, "protective stop"),
+        ({"safety_mode": 13}, "three-position enabling device"),
+        ({"slider": 0.5}, "speed slider is at 50%"),
+        ({"remote": "false"}, "not in remote control"),
+    ):
+        emulator.faults = type(emulator.faults)(**faults)
+        assert ends(["check", *cell]) == 2
+        assert message in capsys.readouterr().err
     assert emulator.received == [] and emulator.programs == []
     assert all(frame[1] == 3 for frame in emulator.gripper_frames)  # reads only
+
+
+def test_the_picture_shows_the_cloud_and_both_boxes_of_any_data(tmp_path, monkeypatch):
+    from mpl_toolkits.mplot3d import Axes3D
+
+    drawn, scatter, plot = [], Axes3D.scatter, Axes3D.plot
+
+    def keep(what):
+        return lambda axes, *args, **more: drawn.append(args[:3]) or what(axes, *args, **more)
+
+    monkeypatch.setattr(Axes3D, "scatter", keep(scatter))
+    monkeypatch.setattr(Axes3D, "plot", keep(plot))
+    points = np.random.default_rng(0).normal(size=(1, 50, 3)).astype(np.float16)
+    meta = robot.boxes(Settings(**BOXES)) | {"positions_in_state": 1}
+    for flat in (points, points * np.float16([1, 1, 0])):  # a plane, too
+        drawn.clear()
+        arrays = (flat, np.zeros((1, 7)), np.zeros((1, 7)), np.array([1]))
+        seen = data.Demonstrations("x", r"half: $\frac$", *arrays, meta)
+        scripts.draw_demonstration(seen, tmp_path / "x.png")
+        lines = np.array([line for line in drawn if np.shape(line) == (3, 2)])
+        assert len(lines) == 24  # the edges of two boxes
+        assert {*lines[:12, 2].ravel()} == {-0.05, 0.5}
+        np.testing.assert_allclose(np.stack(drawn[0], axis=1), flat[0])
 
 
 def test_recording_keeps_finished_episodes_and_drops_the_others(
     emulator, cell, monkeypatch, capsys
 ):
     emulator.hand = 2.0
-    Typing(
-        monkeypatch,
-        (0.3, "s"),
-        (0.6, "e"),
-        (0.1, "s"),
-        (0.3, "d"),
-        (0.1, "s"),
-        (0.3, "g"),
-        (0.3, "e"),
-    )
+    keys = [(0.2, "s"), (0.4, "e"), (0.1, "s"), (0.1, "d"), (0.1, "s"), (0.2, "g"), (0.2, "e")]
+    Typing(monkeypatch, *keys)
     assert ends(record(cell, 2)) == 0, capsys.readouterr().err
     recorded = data.load_demonstrations("demos/stack-cube.npz")
     assert len(recorded) == 2 and recorded.instruction == "Stack the cube."
-    assert (
-        recorded.points.shape[1:] == (64, 3)
-        and recorded.state.shape[1] == recorded.action.shape[1] == 7
-    )
+    assert recorded.points.shape[1:] == (64, 3)
+    assert recorded.state.shape[1] == recorded.action.shape[1] == 7
     frames = recorded.episode(1)
     state, action = recorded.state[frames], recorded.action[frames]
     for now, later, moved in zip(state, state[1:], action):
         np.testing.assert_allclose(robot.compose(now[:6], moved)[:3], later[:3], atol=1e-5)
     assert abs(np.diff(state[:, 0])).sum() > 0.01  # the hand did move the arm
     assert action[0, 6] == 0 and action[-1, 6] == 1  # g closed the gripper on the way
+    meta = recorded.meta
+    assert meta["policy_hz"] == 20 and meta["tcp_offset"][2] == 0.17 and meta["payload_kg"] == 1.1
+    assert len(meta["time_s"]) == len(meta["points_seen"]) == len(recorded.state)
+    assert np.diff(meta["time_s"][: frames.start]).mean() == pytest.approx(0.05, abs=0.01)
     assert is_held(emulator)
-    assert ends(record(cell, 1)) == 2 and "exists" in capsys.readouterr().err
+    assert ends(record(cell, 1)) == 2 and "exists: add --append" in capsys.readouterr().err
+
+    # An interrupted recording goes on; a picture can be drawn; the robot must be the same.
+    Typing(monkeypatch, *EPISODE)
+    assert ends(record(cell, 1, "--append")) == 0
+    longer = data.load_demonstrations("demos/stack-cube.npz")
+    assert len(longer) == 3 and len(longer.meta["time_s"]) == len(longer.state)
+    np.testing.assert_array_equal(longer.state[: len(recorded.state)], recorded.state)
+    scripts.show(["--show", "demos/stack-cube.npz"])
+    assert Path("demos/stack-cube.png").read_bytes().startswith(b"\x89PNG")
+    emulator.tcp_offset = (0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
+    Typing(monkeypatch, (0.1, "q"))
+    assert ends(record(cell, 1, "--append")) == 2
+    assert "was recorded with tcp_offset [0.0, 0.0, 0.17" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "trouble, message",
+    [
+        ({"hand": 0.3}, "dropped: a step jumps by"),
+        ({"pose": [0.3, *START_POSE[1:]]}, "dropped: the TCP is outside its box, at 0.3"),
+        ({"silent": 1}, "s apart, camera or gripper were late"),
+    ],
+)
+def test_an_episode_that_run_would_refuse_is_not_kept(
+    emulator, cell, monkeypatch, capsys, trouble, message
+):
+    Typing(monkeypatch, (0.2, "s"), (0.6, "e"), (0.1, "q"))
+    for name, value in trouble.items():
+        setattr(emulator, name, value)
+
+    def silence():
+        while not emulator.free:
+            time.sleep(0.01)
+        time.sleep(0.15)
+        emulator.faults.gripper_silent = 1
+
+    if "silent" in trouble:
+        threading.Thread(target=silence, daemon=True).start()
+    assert ends(record(cell, 1)) == 0
+    printed = capsys.readouterr().out
+    assert message in printed and "nothing was recorded" in printed
+    assert not Path("demos/stack-cube.npz").exists()
+
+
+def test_a_gripper_that_is_closed_is_recorded_as_closed(emulator, cell, monkeypatch):
+    emulator.registers[0x0103], emulator.opening = 0, 0.0
+    Typing(monkeypatch, *EPISODE)
+    assert ends(record(cell, 1)) == 0
+    assert data.load_demonstrations("demos/stack-cube.npz").action[:, 6].tolist()[0] == 1
+
+
+def test_what_cannot_be_recorded_is_refused_before_connecting(cell, capsys, monkeypatch):
+    Path("robot.json").write_text(json.dumps(BOXES | {"rtde_port": 1, "gripper_port": 1}))
+    for task in ("../evil", "", "a b", ".hidden"):
+        argv = ["record", *cell, "--task", task, "--instruction", "x"]
+        assert ends(argv) == 2 and "--task" in capsys.readouterr().err
+    with scripts.locked(Path("demos")):
+        assert ends(record(cell, 1)) == 2
+    assert "another process runs in demos" in capsys.readouterr().err
+    assert ends(record(cell, 1)) == 2 and "cannot be reached" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_told_with_the_path(emulator, cell, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(data, "save_demonstrations", full)
+    Typing(monkeypatch, *EPISODE)
+    assert ends(record(cell, 1)) == 2
+    error = capsys.readouterr().err
+    assert "demos/stack-cube.npz cannot be written: No space left" in error
+    assert is_held(emulator)
+
+
+def test_a_camera_is_recorded_to_a_file_that_is_replayed(cell, capsys):
+    assert ends(["camera", "--camera", "scene.npz", "--out", "again.npz", "--frames", "3"]) == 0
+    first, again = robot.RecordedCamera("scene.npz"), robot.RecordedCamera("again.npz")
+    assert again.intrinsics == first.intrinsics
+    begin = first.read()
+    for image in (begin, first.read(), first.read(), begin):  # the fourth is the first again
+        np.testing.assert_array_equal(again.read(), image)
 
 
 def test_a_camera_lost_while_recording_ends_it_and_keeps_the_earlier_episodes(
@@ -798,7 +1087,11 @@ def test_a_camera_lost_while_recording_ends_it_and_keeps_the_earlier_episodes(
 ):
     Typing(monkeypatch, (0.2, "s"), (0.4, "e"), (0.1, "s"))
     read = robot.RecordedCamera.read
-    lost = lambda self: np.zeros((120, 160), np.float32) if Path("demos").exists() else read(self)  # noqa: E731
+
+    def lost(self):
+        nothing = np.zeros((120, 160), np.float32)
+        return nothing if Path("demos/stack-cube.npz").exists() else read(self)
+
     monkeypatch.setattr(robot.RecordedCamera, "read", lost)
     assert ends(record(cell, 5)) == 2
     error = capsys.readouterr().err
@@ -826,91 +1119,194 @@ def test_ctrl_c_while_recording_keeps_the_earlier_episodes(emulator, cell, monke
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
 def test_an_arm_is_not_left_free_by_a_process_that_is_gone(emulator, cell, number):
-    command = [sys.executable, str(Path(robot.__file__)), *record(cell, 2)]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline().startswith("keys:")
-    time.sleep(0.3)
+    reading, writing = os.pipe()
+    child = os.fork()  # all is imported there already
+    if child == 0:
+        signal.signal(number, signal.SIG_DFL) if number != signal.SIGKILL else None
+        sys.stdin = os.fdopen(reading)
+        code = ends(record(cell, 2))
+        os._exit(code)
+    deadline = time.monotonic() + 5
+    while not emulator.free and time.monotonic() < deadline:
+        time.sleep(0.01)
     assert emulator.free
-    process.send_signal(number)
-    time.sleep(0.5)
+    os.kill(child, number)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == (-number if number == signal.SIGKILL else 130)
+    time.sleep(0.2)  # the watchdog's 80 ms
     assert not emulator.free
-    process.communicate()
-    assert process.returncode == (130 if number != signal.SIGKILL else -signal.SIGKILL)
+    assert emulator.ends == ["watchdog" if number == signal.SIGKILL else "finished"]
+    os.close(writing)
+
+
+RUN = ["--checkpoint", "policy.pt", "--data", "demos.npz"]
 
 
 def robot_policy(path, **changes):
-    """A checkpoint of an untrained policy with the robot's dimensions, and demonstrations for "
-    "it."""
+    """A checkpoint of an untrained policy with the robot's dimensions, and demonstrations."""
     torch.manual_seed(0)
     config = replace(model.PRESETS["tiny"], state_dim=7, action_dim=7, **changes)
     policy = model.DAMIPolicy(config)
     rng = np.random.default_rng(0)
     state = np.tile(np.append(START_POSE, 0.0), (30, 1)) + 0.01 * rng.normal(size=(30, 7))
-    action = np.concatenate(
-        [rng.uniform(-0.004, 0.004, (30, 6)), rng.uniform(0, 1, (30, 1))], axis=1
-    )
+    small, grip = rng.uniform(-0.004, 0.004, (30, 6)), rng.uniform(0, 1, (30, 1))
+    action = np.concatenate([small, grip], axis=1)
     points = rng.uniform(-0.5, 0.5, (30, 64, 3)).astype(np.float16)
     arrays = (points, state.astype(np.float32), action.astype(np.float32), np.array([30]))
-    recorded = data.Demonstrations("stack-cube", "Stack the cube.", *arrays, {})
+    meta = {"policy_hz": 20.0, "tcp_offset": [0.0, 0.0, 0.17, 0.0, 0.0, 0.0], "payload_kg": 1.1}
+    recorded = data.Demonstrations("stack-cube", "Stack the cube.", *arrays, meta)
     policy.normalizer.fit(*(torch.from_numpy(x) for x in (points.astype(np.float32), *arrays[1:3])))
-    data.save_demonstrations("demos.npz", recorded)
-    info = {
-        "suite": "own",
-        "preset": "tiny",
-        "arguments": {},
-        "text_weights": "random-seed-0",
-        "step": 0,
-    }
-    scripts.save_checkpoint(path, policy, **info)
+    data.save_demonstrations(Path(path).with_name("demos.npz"), recorded)
+    info = {"suite": "own", "preset": "tiny", "arguments": {}, "step": 0}
+    scripts.save_checkpoint(path, policy, text_weights="random-seed-0", **info)
 
 
-def test_running_moves_the_arm_within_its_limits_and_ends_with_a_stop(emulator, cell, capsys):
-    robot_policy("policy.pt")
-    argv = ["run", *cell, "--checkpoint", "policy.pt", "--data", "demos.npz", "--seconds", "1.5"]
-    assert ends(argv) == 0, capsys.readouterr().err
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("policy")
+    robot_policy(folder / "policy.pt")
+    return folder
+
+
+@pytest.fixture
+def running(cell, trained, monkeypatch):
+    """Arguments of `run`, with a checkpoint and demonstrations."""
+    cached = functools.cache(clip.load_clip_text_encoder)
+    monkeypatch.setattr(clip, "load_clip_text_encoder", TEXT.setdefault("encoder", cached))
+    for name in ("policy.pt", "demos.npz"):
+        shutil.copy(trained / name, name)
+    return ["run", *cell, *RUN]
+
+
+TEXT = {}
+
+
+def the_log():
+    """The recording that a run has left."""
+    (path,) = Path("runs/robot").glob("stack-cube-*.npz")
+    return data.load_demonstrations(path)
+
+
+def test_running_moves_the_arm_within_its_limits_and_ends_with_a_stop(
+    emulator, settings, running, capsys
+):
+    assert ends([*running, "--seconds", "1"]) == 0, capsys.readouterr().err
     printed = capsys.readouterr().out
-    assert "stack-cube: running" in printed and "packages at 125 Hz" in printed
+    assert "stack-cube: run" in printed and "packages at 125 Hz" in printed
     assert np.linalg.norm(np.subtract(emulator.pose, START_POSE)[:3]) > 1e-3
-    assert emulator.registers[0x0200] == 1 and any(
-        frame[3] == 3 for frame in emulator.gripper_frames
-    )
+    assert emulator.registers[0x0200] == 1
+    assert any(frame[3] == 3 for frame in emulator.gripper_frames)
+    assert_stop_is_last(emulator)
+    assert_within_limits(emulator, settings)
+
+    # What it saw and did can be looked at, and trained on.
+    log = the_log()
+    assert log.meta["ended"] == "done" and log.meta["made_by"] == "robot.run"
+    assert len(log.state) == len(log.meta["commanded"]) == len(log.meta["points_seen"]) >= 16
+    done = np.array(log.meta["commanded"])
+    for before, after, action in zip(done, done[1:], log.action):
+        if np.linalg.norm(action[:3]) < 0.005:  # not cut short
+            np.testing.assert_allclose(after[:3] - before[:3], action[:3], atol=4e-3)
+    policy, _ = scripts.load_checkpoint("policy.pt")
+    assert len(data.WindowSampler(log, policy.config)) > 0
+
+
+def test_the_first_frames_are_seen_after_the_gripper_is_ready(emulator, settings, running):
+    emulator.faults.initializing = 0.3
+
+    def bump():
+        while emulator.registers[0x0200] != 2:
+            time.sleep(0.005)
+        emulator.pose[1] += 0.12  # somebody moves the arm meanwhile
+
+    threading.Thread(target=bump, daemon=True).start()
+    assert ends([*running, "--seconds", "0.5"]) == 0
+    assert the_log().state[0, 1] == pytest.approx(START_POSE[1] + 0.12, abs=0.005)
+    assert_within_limits(emulator, settings)
+
+
+def test_a_start_pose_is_reached_slowly(emulator, settings, running):
+    content = json.loads(Path("robot.json").read_text())
+    start = [-0.22, -0.55, 0.31, 0.0, 3.0, 0.02]
+    Path("robot.json").write_text(json.dumps(content | {"start_pose": start}))
+    assert ends([*running, "--seconds", "0"]) == 0
+    np.testing.assert_allclose(emulator.pose, start, atol=2e-3)
+    assert emulator.fastest[0] < 0.3 * settings.max_speed_m_s
+
+
+def test_a_recorded_episode_is_replayed_from_where_it_began(emulator, settings, running, capsys):
+    recorded = data.load_demonstrations("demos.npz")
+    argv = ["replay", *running[1:-4], "--data", "demos.npz"]
+    assert ends(argv) == 0, capsys.readouterr().err
+    expected = recorded.state[0, :6].astype(float)
+    log = the_log()
+    np.testing.assert_allclose(log.meta["commanded"][0], expected, atol=1e-5)
+    np.testing.assert_allclose(log.action[:30], recorded.action, atol=1e-6)
+    for action in recorded.action:
+        expected = robot.compose(expected, action)
+    np.testing.assert_allclose(emulator.pose, expected, atol=4e-3)
+    assert_within_limits(emulator, settings)
+    assert ends([*argv, "--episode", "7"]) == 2 and "no --episode 7" in capsys.readouterr().err
+
+
+def test_actions_that_are_cut_short_are_told(emulator, settings, capsys):
+    with Moving(settings) as servo:
+        servo.follow(steps(drz=0.05))
+        time.sleep(0.1)
+    servo.report()
+    assert "8 actions were faster than 0.20 m/s, 0.13 rad/s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "changes, arguments, message",
+    [
+        ({"policy_hz": 10}, [], "recorded with policy_hz 20.0, now it is 10.0"),
+        ({}, ["--device", "cuda:99"], "--device cuda:99 cannot be used here"),
+        ({}, ["--device", "nonsense"], "--device nonsense cannot be used here"),
+        ({}, ["--out", "demos.npz"], "demos.npz exists"),
+    ],
+)
+def test_a_robot_or_device_that_does_not_fit_is_refused(
+    emulator, running, capsys, changes, arguments, message
+):
+    content = json.loads(Path("robot.json").read_text())
+    Path("robot.json").write_text(json.dumps(content | changes))
+    assert ends([*running, *arguments]) == 2
+    assert message in capsys.readouterr().err and emulator.received == []
+
+
+def test_an_error_of_the_policy_stops_the_arm(emulator, running, monkeypatch, capsys):
+    def broken(*_):
+        raise IndexError("shapes")
+
+    monkeypatch.setattr(model.DAMIPolicy, "sample_actions", broken)
+    assert ends(running) == 2
+    assert "the policy failed: IndexError('shapes')" in capsys.readouterr().err
     assert_stop_is_last(emulator)
 
 
-def test_a_dry_run_does_everything_but_motion(emulator, cell, capsys):
-    robot_policy("policy.pt")
-    argv = [
-        "run",
-        *cell,
-        "--checkpoint",
-        "policy.pt",
-        "--data",
-        "demos.npz",
-        "--seconds",
-        "1",
-        "--dry-run",
-    ]
-    assert ends(argv) == 0, capsys.readouterr().err
+def test_a_dry_run_does_everything_but_motion(emulator, running, capsys):
+    assert ends([*running, "--seconds", "0.5", "--dry-run"]) == 0, capsys.readouterr().err
     assert emulator.received == [] and emulator.programs == [] and emulator.owners == {}
     assert all(frame[1] == 3 for frame in emulator.gripper_frames)
     np.testing.assert_allclose(emulator.pose, START_POSE)
 
 
-def test_trouble_in_a_dry_run_ends_it_with_the_reason_and_sends_nothing(emulator, cell, capsys):
-    robot_policy("policy.pt")
-    threading.Timer(1.5, lambda: setattr(emulator.faults, "safety_mode", 3)).start()
-    argv = [
-        "run",
-        *cell,
-        "--checkpoint",
-        "policy.pt",
-        "--data",
-        "demos.npz",
-        "--seconds",
-        "20",
-        "--dry-run",
-    ]
-    assert ends(argv) == 2
+def when_it_runs(emulator, act):
+    """Calls `act` as soon as a program, or a dry run, is on its way."""
+
+    def wait():
+        while not emulator.received and len(emulator.gripper_frames) < 8:
+            time.sleep(0.01)
+        time.sleep(0.2)
+        act()
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def test_trouble_in_a_dry_run_ends_it_with_the_reason_and_sends_nothing(emulator, running, capsys):
+    when_it_runs(emulator, lambda: setattr(emulator.faults, "safety_mode", 3))
+    assert ends([*running, "--dry-run"]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "protective stop" in error and emulator.received == []
 
@@ -931,60 +1327,56 @@ def test_keys_that_arrive_together_are_all_read(monkeypatch):
     ],
 )
 def test_trouble_while_running_stops_the_arm_and_ends_the_command_with_the_reason(
-    emulator, cell, capsys, fault, value, message
+    emulator, running, capsys, fault, value, message
 ):
-    robot_policy("policy.pt")
-    threading.Timer(1.5, lambda: setattr(emulator.faults, fault, value)).start()
-    argv = ["run", *cell, "--checkpoint", "policy.pt", "--data", "demos.npz", "--seconds", "20"]
-    assert ends(argv) == 2
+    when_it_runs(emulator, lambda: setattr(emulator.faults, fault, value))
+    assert ends(running) == 2
+    assert message in the_log().meta["ended"]
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and message in error
     if fault != "drop":  # there the watchdog stops it
         assert_stop_is_last(emulator)
 
 
-def test_ctrl_c_while_running_stops_the_arm(emulator, cell, monkeypatch):
-    robot_policy("policy.pt")
-    execute, chunks = robot.execute, []
+def test_ctrl_c_while_running_stops_the_arm(emulator, running, monkeypatch):
+    sample, chunks = model.DAMIPolicy.sample_actions, []
 
     def interrupted(*args):
         chunks.append(None)
         if len(chunks) == 2:
             raise KeyboardInterrupt
-        return execute(*args)
+        return sample(*args)
 
-    monkeypatch.setattr(robot, "execute", interrupted)
-    assert ends(["run", *cell, "--checkpoint", "policy.pt", "--data", "demos.npz"]) == 130
+    monkeypatch.setattr(model.DAMIPolicy, "sample_actions", interrupted)
+    assert ends(running) == 130
     assert_stop_is_last(emulator)
+    assert the_log().meta["ended"] == "KeyboardInterrupt"
 
 
-@pytest.mark.parametrize("lost_for", [0.4, 60])
+@pytest.mark.parametrize("lost_for", [0.2, 60])
 def test_a_camera_that_gives_nothing_holds_the_arm_and_then_stops_it(
-    emulator, cell, monkeypatch, capsys, lost_for
+    emulator, running, monkeypatch, capsys, lost_for
 ):
-    robot_policy("policy.pt")
+    content = json.loads(Path("robot.json").read_text())
+    Path("robot.json").write_text(json.dumps(content | {"max_hold_s": 0.5}))
     read, began = robot.RecordedCamera.read, []
 
     def failing(self):
         began.append(time.monotonic())
-        lost = 1.0 < time.monotonic() - began[0] < 1.0 + lost_for
+        lost = 0.6 < time.monotonic() - began[0] < 0.6 + lost_for
         return np.zeros((120, 160), np.float32) if lost else read(self)
 
     monkeypatch.setattr(robot.RecordedCamera, "read", failing)
-    argv = ["run", *cell, "--checkpoint", "policy.pt", "--data", "demos.npz", "--seconds", "4"]
-    assert ends(argv) == (2 if lost_for > 1 else 0)
+    assert ends([*running, "--seconds", "1.5"]) == (2 if lost_for > 1 else 0)
     error = capsys.readouterr().err
-    assert lost_for < 1 or (
-        error.count("\n") == 1 and "no new actions for 2 s: the camera's depth is empty" in error
-    )
+    message = "no new actions for 0.5 s: the camera's depth is empty"
+    assert lost_for < 1 or (error.count("\n") == 1 and message in error)
     assert_stop_is_last(emulator)
 
 
 def test_a_policy_that_does_not_fit_the_robot_is_refused_before_connecting(cell, capsys):
     robot_policy("policy.pt", num_points=128)
-    argv = ["run", *cell, "--checkpoint", "policy.pt", "--data", "demos.npz"]
-    Path("robot.json").write_text(
-        json.dumps(BOXES | {"num_points": 64, "rtde_port": 1})
-    )  # nobody listens there
-    assert ends(argv) == 2
-    assert "128 points; the robot 7, 7 and 64" in capsys.readouterr().err
+    content = BOXES | {"num_points": 64, "rtde_port": 1}  # nobody listens there
+    Path("robot.json").write_text(json.dumps(content))
+    assert ends(["run", *cell, *RUN]) == 2
+    assert "points, the robot (7, 7, 64)" in capsys.readouterr().err
