@@ -607,10 +607,13 @@ POLICIES |= {"flow": FlowPolicy, "mamba": MambaPolicy, "freq": FreqPolicy}
 
 def build_policy(config: PolicyConfig) -> DAMIPolicy:
     """The policy that a configuration describes, with fresh weights."""
+    problem = None
     if config.policy != "dami" and config.reads_task:
-        raise ValueError(f"{config.policy} reads no task: use demo_encoder none and tcfm none")
+        problem = "reads no task: use demo_encoder none and tcfm none"
     if config.policy in ("flow", "freq") and config.sampler != "ddim":
-        raise ValueError(f"{config.policy} has a sampler of its own: leave out {config.sampler}")
+        problem = f"has a sampler of its own: leave out {config.sampler}"
+    if problem:
+        raise ValueError(f"{config.policy} {problem}")
     whole = config.demo_encoder != "mlp" and (config.tcfm != "none" or not config.reads_task)
     return (POLICIES[config.policy] if whole else AblatedPolicy)(config)
 

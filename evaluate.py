@@ -272,8 +272,6 @@ def evaluate(
     Returns:
         task -> E booleans, in the order of the episodes. They do not depend on `workers`.
     """
-    if episodes < 1:
-        raise ValueError(f"--episodes is {episodes}: use at least 1")
     seeds = [evaluation_seed(seed, i) for i in range(episodes)]
     chunks = [seeds[i : i + EPISODES_A_JOB] for i in range(0, episodes, EPISODES_A_JOB)]
     jobs = [
@@ -517,11 +515,9 @@ def of_next_task(each: dict[str, Any]) -> dict[str, Any]:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    for name in ("demonstrations", "episodes"):
-        if getattr(args, name) < 1:
-            raise ValueError(f"--{name} is {getattr(args, name)}: use at least 1")
-    if args.top < 0:
-        raise ValueError(f"--top is {args.top}: use at least 0")
+    for name, least in {"demonstrations": 1, "episodes": 1, "top": 0}.items():
+        if (value := getattr(args, name)) < least:
+            raise ValueError(f"--{name} is {value}: use at least {least}")
     evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after collecting
     if args.gif and not (args.task and len(args.task) == 1 and args.gif.endswith(".gif")):
         raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")

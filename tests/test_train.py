@@ -296,6 +296,22 @@ def test_two_processes_under_torchrun_train_as_one_does(recorded, tmp_path):
     assert moved.norm() > 0.1
 
 
+def test_torchruns_variables_alone_end_in_one_line(monkeypatch, capsys, recorded):
+    monkeypatch.setenv("WORLD_SIZE", "2")  # as left behind in a shell
+    for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    assert "RANK" in fails(train, [*FEW, "--data", recorded], capsys)
+
+
+def test_lines_of_metrics_that_were_cut_are_dropped(tmp_path):
+    for step in (1, 2, 3):
+        scripts.log(tmp_path, step=step, loss=0.5)
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(path.read_text().replace('{"step": 2, "loss": 0.5}', '{"step": 2, "lo'))
+    scripts.rewind_metrics(tmp_path, 3)
+    assert [line["step"] for line in metrics(tmp_path)] == [1, 3]
+
+
 def test_more_processes_than_tasks_are_refused_before_anything_waits(monkeypatch, capsys):
     monkeypatch.setenv("WORLD_SIZE", "4")
     monkeypatch.setenv("RANK", "0")
@@ -341,6 +357,9 @@ def test_own_recordings_of_any_length_and_dimension_are_trained_on_and_adapted_t
         ("--lr nan", "--lr is nan"),
         ("--multi-task-share 7", "--multi-task-share is 7.0: use at most 1"),
         ("--warmup -3", "--warmup is -3: use at least 0"),
+        ("--lr inf", "--lr is inf: use at most 1.79"),
+        (f"--seed {2**65}", f"--seed is {2**65}: use at most 4294967295"),
+        ("--device meta", "--device meta cannot be used here"),
     ],
 )
 def test_a_wrong_argument_ends_in_one_line_that_says_what_to_do(options, message, recorded, capsys):
