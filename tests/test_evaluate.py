@@ -97,16 +97,26 @@ def test_evaluating_again_with_other_workers_gives_the_same_episodes(
     run, recorded, monkeypatch, capsys
 ):
     monkeypatch.setattr(evaluate, "EPISODES_A_JOB", 1)  # as in the run
-    options = "--episodes 2 --workers 1 --top 2 --out report"
+    options = "--episodes 2 --workers 1 --out report"
     evaluate.main(evaluating(run, recorded, options))
     report = json.loads(Path("report/success.json").read_text())
     trained = json.loads((run / "success.json").read_text())
     label = "ml10-tiny-seed0/ema-00006"
     assert report["successes"] == {label: trained["successes"]["last checkpoint"]}
-    assert {"mean, last checkpoint", "mean, best 2 checkpoints"} <= set(report["facts"])
-    assert "best 2 checkpoints" in capsys.readouterr().out
     message = fails(evaluate, evaluating(run, recorded, options), capsys)
     assert "already holds success.json: add --overwrite" in message
+
+
+def test_the_best_checkpoints_of_a_run_are_averaged(run, recorded, monkeypatch, capsys):
+    def measured(checkpoint, paths, *_):
+        return {task: [checkpoint.stem == "ema-00003", True] for task in paths}
+
+    monkeypatch.setattr(evaluate, "evaluate", measured)
+    evaluate.main(evaluating(run, recorded, "--episodes 2 --top 2 --out report"))
+    facts = json.loads(Path("report/success.json").read_text())["facts"]
+    assert facts["mean, last checkpoint"] == "50.0 (one run)"
+    assert facts["mean, best 2 checkpoints"] == "75.0 (one run)"
+    assert "best 2 checkpoints" in capsys.readouterr().out
 
 
 def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recorded, monkeypatch):

@@ -85,14 +85,22 @@ def test_adaptation_is_repeatable_and_moves_only_what_has_a_learning_rate(run, r
     assert moved(frozen) == {"unet"}
 
 
-def test_all_novel_tasks_are_adapted_to_as_each_alone(run, recorded):
-    finetune.main([*adapting(run, recorded, "--episodes 1", task="novel"), "--out", "all"])
+def test_all_novel_tasks_are_adapted_to_as_each_alone(run, recorded, monkeypatch):
+    def measured(policy, paths, *_):
+        return {task: [True, policy.stem != "ema-00006"] for task in paths}
+
+    monkeypatch.setattr(evaluate, "evaluate", measured)
+    options = "--episodes 2 --curve 1 9"
+    finetune.main([*adapting(run, recorded, options, task="novel"), "--out", "all"])
     finetune.main([*adapting(run, recorded), "--out", "alone"])
     adapted, info = weights("all/door-close/adapted.pt")
     assert same_bits(dict(adapted), dict(weights("alone/adapted.pt")[0]))
     assert info["adapted_to"] == "door-close"
-    report = json.loads(Path("all/success.json").read_text())
-    assert list(report["successes"]["after"]) == ["door-close"]
+    between = weights("all/door-close/adapted-00001.pt")[0]  # 9 is more than there are
+    assert any(not torch.equal(between[name], adapted[name]) for name in adapted)
+    columns = json.loads(Path("all/success.json").read_text())["successes"]
+    expected = {"before": [True, False], "1 steps": [True, True], "after": [True, True]}
+    assert columns == {name: {"door-close": episodes} for name, episodes in expected.items()}
 
 
 def test_rollouts_read_the_demonstrations_that_were_adapted_to(run, recorded, monkeypatch):
