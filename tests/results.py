@@ -51,6 +51,10 @@ def take(results: dict, run: Path) -> None:
     minutes = [line["seconds"] for line in lines if "loss" in line][-1] / 60
     config = json.loads((run / "config.json").read_text())
     results[run.name] = {"training": {"minutes": round(minutes, 1), **config}}
+    inner = [(line["loss_before"], line["loss"]) for line in lines if "loss_before" in line][-500:]
+    if inner:  # the query losses of the last 500 outer steps
+        before, after = np.mean(inner, axis=0).round(5).tolist()
+        results[run.name]["training"]["inner_step"] = {"before": before, "after": after}
     for name in REPORTS:
         path = Path(f"{run}-{name}") / "success.json"
         if path.exists():
@@ -98,42 +102,42 @@ def table(head: list[str], rows: list[list[object]]) -> str:
 
 
 def means_table(results: dict) -> str:
-    """The means of DAMI and of multi-task training, the paper's beside them."""
+    """The means of DAMI, with and without the instruction, of multi-task training, the paper's."""
     shown = {
-        "base tasks": ("base", 0, "base"),
-        "novel tasks, no gradient step": ("novel", "before", ""),
-        "novel tasks, 200 steps": ("novel", "after", "novel"),
+        "base tasks": (("base", 0), ("swap", 0), "base"),
+        "novel tasks, no gradient step": (("novel", "before"), ("alone", "before"), ""),
+        "novel tasks, 200 steps": (("novel", "after"), ("alone", "after"), "novel"),
     }
     rows = []
-    for title, (report, column, split) in shown.items():
+    for title, (told, alone, split) in shown.items():
         theirs = [
             f"{np.mean([PAPER[split][task][name] for task in TASKS[split]]):.1f}" if split else ""
             for name in ("DP3", "DAMI")
         ]
-        ours = [mean(results, v, report, column) for v in ("ml10-dami", "ml10-neither")]
-        rows.append([title, *ours, *theirs])
-    return table(
-        ["ML10", "DAMI", "multi-task, no demonstration", "paper, DP3", "paper, DAMI"], rows
-    )
+        ours = [mean(results, "ml10-dami", *report) for report in (told, alone)]
+        rows.append([title, *ours, mean(results, "ml10-neither", *told), *theirs])
+    head = ["ML10", "DAMI", "DAMI, not told", "multi-task", "paper, DP3", "paper, DAMI"]
+    return table(head, rows)
 
 
 def by_task_table(split: str) -> Callable[[dict], str]:
     """A row a task: DAMI's seeds together, and the paper's."""
-    columns = (
-        {"DAMI": 0} if split == "base" else {"no gradient step": "before", "200 steps": "after"}
-    )
+    columns = {"DAMI": ("base", 0), "DAMI, not told": ("swap", 0)}
+    if split == "novel":
+        columns = {"no gradient step": ("novel", "before"), "200 steps": ("novel", "after")}
+        columns |= {f"{name}, not told": ("alone", place) for name, (_, place) in columns.items()}
 
     def make(results: dict) -> str:
         rows = []
         for task in TASKS[split]:
             cells = []
             for column in columns.values():
-                found = [measured(run, split, column) for run in runs_of(results, "ml10-dami")]
+                found = [measured(run, *column) for run in runs_of(results, "ml10-dami")]
                 episodes = [s for successes in found if successes for s in successes[task]]
                 cells.append(format_success(sum(episodes), len(episodes)) if episodes else "")
             theirs = [f"{PAPER[split][task][name]:.1f}" for name in ("DP3", "DAMI")]
             rows.append([task, *cells, *theirs])
-        means = [mean(results, "ml10-dami", split, column) for column in columns.values()]
+        means = [mean(results, "ml10-dami", *column) for column in columns.values()]
         theirs = [np.mean([PAPER[split][t][n] for t in TASKS[split]]) for n in ("DP3", "DAMI")]
         rows.append(["**mean**", *means, *(f"{value:.1f}" for value in theirs)])
         return table(["task", *columns, "paper, DP3", "paper, DAMI"], rows)

@@ -46,6 +46,7 @@ REPORTS = {  # name -> command; {run} is the run's folder
     "told": "evaluate.py --checkpoint {run} --swap demonstration instruction",
     "swap": "evaluate.py --checkpoint {run} --without instruction --swap demonstration",
     "one-shot": "evaluate.py --checkpoint {run} --split novel --without instruction",
+    "alone": "finetune.py --task novel --checkpoint {run} --no-instruction",
 }
 
 
@@ -76,7 +77,7 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
     last = run / f"ema-{steps:05d}.pt"
     listed = [Job(f"train.py {flags}{resume}", last, run.with_suffix(".log"))]
     for name, command in REPORTS.items():
-        if variant != "dami" and name in ("told", "swap", "one-shot"):
+        if variant != "dami" and name in ("told", "swap", "one-shot", "alone"):
             continue  # of interest only where a demonstration is read
         out = Path(f"{run}-{name}")
         measured = f"{command.format(run=run)} --seed {SEED} --episodes {episodes} --workers 1"
