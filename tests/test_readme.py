@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"^```bash\n(.*?)^```", README, re.M | re.S)
 LINES = [re.split(r"\s+# ", line)[0].strip() for block in BLOCKS for line in block.splitlines()]
-INLINE = re.findall(r"`((?:OMP_NUM_THREADS=\d+ )?(?:python|torchrun)\s[^`]+)`", README)
+INLINE = re.findall(r"(?<!`)`((?:OMP_NUM_THREADS=\d+ )?(?:python|torchrun)\s[^`]+)`", README)
 COMMANDS = sorted({re.sub(r"\s+", " ", command) for command in LINES + INLINE if command})
 PARSERS = ("simulator", "train", "finetune", "evaluate", "robot")
 

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+import scripts
 import simulator
 from data import load_demonstrations, save_demonstrations
 from scripts import command_line, run_jobs
@@ -367,7 +368,7 @@ def test_failed_and_interrupted_attempts_are_not_kept(reach, monkeypatch):
 
 
 def test_a_finished_file_is_kept_and_a_shorter_one_is_made_again(collected, monkeypatch):
-    monkeypatch.setattr(simulator, "ProcessPoolExecutor", None)  # collecting anything would fail
+    monkeypatch.setattr(scripts, "ProcessPoolExecutor", None)  # collecting anything would fail
     before = collected.stat().st_mtime_ns
     for episodes in (2, 1):
         kept = collect([collected.stem], collected.parent, episodes)
