@@ -20,6 +20,7 @@ import argparse
 import json
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -550,29 +551,31 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError(f"{checkpoint} was made with text weights {each['text_weights']!r}")
         if each.get("adapted_to", tasks[0]) != tasks[0] or ("adapted_to" in each and tasks[1:]):
             raise ValueError(f"{checkpoint} was adapted to {each['adapted_to']}: measure it alone")
-    paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
-    recorded = {task: load_demonstrations(paths[task]).take(args.demonstrations) for task in tasks}
-    instructions = [recorded[task].instruction for task in tasks]
-    features, identity = text_features(instructions, args.clip_weights, info["text_weights"])
-    text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
+    out = Path(args.out)
+    with nullcontext() if args.gif else scripts.locked(out):
+        if not args.gif:
+            scripts.claim_folder(out, args.overwrite)
+        paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
+        recorded = [load_demonstrations(path).take(args.demonstrations) for path in paths.values()]
+        said = [demonstrations.instruction for demonstrations in recorded]
+        features, identity = text_features(said, args.clip_weights, info["text_weights"])
+        text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
 
-    if args.gif:
-        sampler = WindowSampler(recorded[tasks[0]], policy.config, device)
-        success = write_gif(policy, sampler, text[tasks[0]], args.seed, args.gif)
-        print(f"{tasks[0]}: {'success' if success else 'failure'}; wrote {args.gif}")
-        return
+        if args.gif:
+            sampler = WindowSampler(recorded[0], policy.config, device)
+            success = write_gif(policy, sampler, text[tasks[0]], args.seed, args.gif)
+            print(f"{tasks[0]}: {'success' if success else 'failure'}; wrote {args.gif}")
+            return
 
-    facts = {"title": " ".join(args.task or []) or f"{suite}, {args.split} tasks"}
-    facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
-    facts |= scripts.report_facts("evaluate.py", argv, device)
-    if args.sampler:
-        facts["sampler"] = args.sampler
-    if args.without:
-        facts["without"] = " and ".join(args.without)
+        facts = {"title": " ".join(args.task or []) or f"{suite}, {args.split} tasks"}
+        facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
+        facts |= scripts.report_facts("evaluate.py", argv, device)
+        if args.sampler:
+            facts["sampler"] = args.sampler
+        if args.without:
+            facts["without"] = " and ".join(args.without)
         if "instruction" in args.without:
             text = {task: torch.zeros_like(feature) for task, feature in text.items()}
-    with scripts.locked(Path(args.out)):
-        scripts.claim_folder(Path(args.out), args.overwrite)
         measure(args, suite, runs, labels, paths, text, device, facts)
 
 

@@ -37,6 +37,12 @@ def pytest_collection_finish(session):
         session.config.tutorial = subprocess.Popen(command, **options)
 
 
+def pytest_unconfigure(config):
+    """Nor does it outlive them."""
+    if hasattr(config, "tutorial"):
+        config.tutorial.kill()
+
+
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory):
     """A folder with two expert demonstrations of each task in BASE and NOVEL."""
