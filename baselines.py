@@ -44,15 +44,10 @@ from model import (
     PolicyConfig,
     ResidualBlock,
     TransformerBlock,
+    sinusoids,
 )
 
 # ---- What the three share ------------------------------------------------------------------------
-
-
-def check_shape(name: str, x: Tensor, shape: tuple[int, ...]) -> None:
-    """Raises ValueError for a shape that would broadcast to a wrong result without an error."""
-    if x.shape != shape:
-        raise ValueError(f"{name} is {tuple(x.shape)}, the policy takes {shape}")
 
 
 def draw(
@@ -61,13 +56,6 @@ def draw(
     """`torch.randn` or `torch.rand` of a shape, by a generator on any device, to that of `like`."""
     source = like.device if generator is None else generator.device
     return function(*shape, generator=generator, device=source).to(like.device)
-
-
-def executed(policy: DAMIPolicy, actions: Tensor) -> Tensor:
-    """Normalized actions (B, H, A) -> those from the newest observation on (B, Ta, A)."""
-    newest = policy.config.n_obs_steps - 1
-    chunk = actions[:, newest : newest + policy.config.n_action_steps]
-    return policy.normalizer.unnormalize("action", chunk)
 
 
 # ---- FlowPolicy ----------------------------------------------------------------------------------
@@ -103,6 +91,9 @@ class FlowPolicy(DAMIPolicy):
         times = draw(torch.rand, n, like=like, generator=generator)
         return {"noise": noise, "times": self.START + (1 - self.START) * times}
 
+    def shapes(self, B: int, *frames: int) -> dict[str, tuple[int, ...]]:
+        return super().shapes(B, *frames) | {"times": (B,)}
+
     def loss(
         self, points: Tensor, state: Tensor, action: Tensor, noise: Tensor, times: Tensor, **task
     ) -> Tensor:
@@ -111,8 +102,7 @@ class FlowPolicy(DAMIPolicy):
         `noise` (B, H, A) is a0, `times` (B,) float t; of `task` nothing is read.
         """
         self.encode_demo(**task)
-        self.check_shapes(points=points, state=state, action=action, noise=noise)
-        check_shape("times", times, (len(points),))
+        self.check_shapes(points=points, state=state, action=action, noise=noise, times=times)
 
         clean = self.normalizer.normalize("action", action)  # a1, (B, H, A)
         t = times.to(clean.dtype)[:, None, None]  # (B, 1, 1)
@@ -145,7 +135,7 @@ class FlowPolicy(DAMIPolicy):
         shape = (len(points), config.horizon, config.action_dim)
         noise = draw(torch.randn, *shape, like=points, generator=generator)
         start = torch.full((len(points),), self.START, device=points.device)
-        return executed(self, noise + self.velocity(noise, start, observation))
+        return self.executed(noise + self.velocity(noise, start, observation))
 
 
 # ---- Mamba Policy --------------------------------------------------------------------------------
@@ -281,34 +271,23 @@ class MambaPolicy(DAMIPolicy):
         kept = draw(torch.rand, *shape, like=like, generator=generator) >= self.DROP
         return drawn | {"drop_path": kept / (1 - self.DROP)}
 
-    def loss(
-        self,
-        points: Tensor,
-        state: Tensor,
-        action: Tensor,
-        noise: Tensor,
-        timesteps: Tensor,
-        drop_path: Tensor,
-        **task: Tensor,
+    def encode_demo(
+        self, *task: Tensor, drop_path: Tensor | None = None, **named: Tensor
+    ) -> Context:
+        """`drop_path` (windows, branches), 0 or 1.25 for each branch, where a context stands."""
+        super().encode_demo(*task, **named)  # reads nothing, and refuses what is not a task
+        return drop_path
+
+    def denoise(
+        self, noisy: Tensor, timesteps: Tensor, observation: Tensor, context: Context
     ) -> Tensor:
-        """DP3's loss, () float; arguments as of `DAMIPolicy.loss`.
-
-        `drop_path` (B, branches) holds each branch's factor, 0 or 1.25; of `task` nothing is read.
-        """
-        self.encode_demo(**task)
-        self.check_shapes(
-            points=points, state=state, action=action, noise=noise, timesteps=timesteps
-        )
-        check_shape("drop_path", drop_path, (len(points), self.unet.branches))
-
-        clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
-        noisy = self.schedule.add_noise(clean, noise, timesteps)  # A_k, (B, H, A)
-        observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
+        """As `DAMIPolicy`'s; the context is `drop_path`, or None: nothing is dropped."""
         h = self.unet.condition(timesteps, observation)  # (B, C)
-        h = torch.cat([h, drop_path.to(h.dtype)], dim=1)  # (B, C + branches)
-        return F.mse_loss(self.unet(noisy, h), clean)
-
-    forward = loss
+        if context is not None:
+            if context.shape != (shape := (len(h), self.unet.branches)):
+                raise ValueError(f"drop_path is {tuple(context.shape)}, the policy takes {shape}")
+            h = torch.cat([h, context.to(h.dtype)], dim=1)  # (B, C + branches)
+        return self.unet(noisy, h)
 
 
 # ---- FreqPolicy ----------------------------------------------------------------------------------
@@ -319,14 +298,6 @@ def dct_matrix(n: int) -> Tensor:
     k, place = torch.arange(n, dtype=torch.float64)[:, None], torch.arange(n) + 0.5
     matrix = math.sqrt(2 / n) * torch.cos(math.pi / n * k * place)
     return torch.cat([matrix[:1] / math.sqrt(2), matrix[1:]])
-
-
-def sinusoids(timesteps: Tensor, dim: int) -> Tensor:
-    """(...) int64 -> (..., dim): sines, then cosines, of geometrically falling rates."""
-    half = dim // 2
-    exponents = torch.arange(half, device=timesteps.device) * (-math.log(10000) / (half - 1))
-    angles = timesteps[..., None] * exponents.exp()  # (..., dim / 2)
-    return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
 class MaskedBlock(TransformerBlock):
@@ -483,6 +454,11 @@ class FreqPolicy(DAMIPolicy):
         mask = rank < (H * share).ceil()[:, None]
         return {"noise": noise, "timesteps": timesteps, "cutoffs": cutoffs, "mask": mask}
 
+    def shapes(self, B: int, *frames: int) -> dict[str, tuple[int, ...]]:
+        H = self.config.horizon
+        own = {"timesteps": (B, H), "cutoffs": (B,), "mask": (B, H)}
+        return super().shapes(B, *frames) | own
+
     def loss(
         self,
         points: Tensor,
@@ -500,11 +476,8 @@ class FreqPolicy(DAMIPolicy):
         for hidden places. Of `task` nothing is read.
         """
         self.encode_demo(**task)
-        self.check_shapes(points=points, state=state, action=action, noise=noise)
-        B, H = len(points), self.config.horizon
-        check_shape("timesteps", timesteps, (B, H))
-        check_shape("cutoffs", cutoffs, (B,))
-        check_shape("mask", mask, (B, H))
+        drawn = {"noise": noise, "timesteps": timesteps, "cutoffs": cutoffs, "mask": mask}
+        self.check_shapes(points=points, state=state, action=action, **drawn)
 
         clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
         tokens = (x.flatten(0, 1)[:, None] for x in (clean, noise))  # 2 x (B * H, 1, A)
@@ -539,7 +512,7 @@ class FreqPolicy(DAMIPolicy):
                 a = self.schedule.alphas_cumprod[k]
                 clean = (actions - (1 - a).sqrt() * noise) / a.sqrt()
                 actions = self.schedule.step(clean, k, actions)
-        return executed(self, actions)
+        return self.executed(actions)
 
 
 # ---- Ablations of DAMI ---------------------------------------------------------------------------

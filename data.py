@@ -96,7 +96,7 @@ class Demonstrations:
         if len(set(lengths.values())) > 1:
             return f"lengths differ: {lengths}"
 
-        if not re.fullmatch(r"\w[\w.-]{0,99}", self.task):
+        if not re.fullmatch(NAME, self.task):
             return f"task {self.task[:100]!r} is no name of letters, digits, '-', '_' and '.'"
         positions = self.meta.get("positions_in_state", 0)
         if type(positions) is not int or not 0 <= 3 * positions <= self.state.shape[1]:
@@ -130,6 +130,7 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
 
 
 PARTS = [part.name for part in fields(Demonstrations)]
+NAME = r"\w[\w.-]{0,99}"  # of a task, and so of files and folders
 
 
 def save_demonstrations(path: str | Path, demonstrations: Demonstrations) -> None:

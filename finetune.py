@@ -79,8 +79,8 @@ def adapt_policy(
     adapted = copy.deepcopy(policy).train()  # line 2
     average = ema_model(adapted)
     average.module.eval()
-    parts = adapted.parameter_groups()
-    groups = [{"params": parts[p], "lr": lr} for p, lr in learning_rates.items() if parts[p]]
+    parts = adapted.parameter_groups().items()
+    groups = [{"params": part, "lr": learning_rates[name]} for name, part in parts if part]
     optimizer = torch.optim.AdamW(groups, betas=(0.95, 0.999), weight_decay=1e-6, fused=True)
     generator = torch.Generator().manual_seed(seed)
 

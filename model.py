@@ -336,6 +336,14 @@ class ResidualBlock(nn.Module):
         return self.conv2(scale * self.conv1(x) + bias) + self.residual(x)
 
 
+def sinusoids(timesteps: Tensor, dim: int) -> Tensor:
+    """(...) int64 -> (..., dim): sines, then cosines, of geometrically falling rates."""
+    half = dim // 2
+    exponents = torch.arange(half, device=timesteps.device) * (-math.log(10000) / (half - 1))
+    angles = timesteps[..., None] * exponents.exp()  # (..., dim / 2)
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
 class ConditionalUNet1d(nn.Module):
     """DP3's 1D U-Net over time, with task-conditioned feature modulation (TCFM).
 
@@ -377,10 +385,7 @@ class ConditionalUNet1d(nn.Module):
 
     def condition(self, timesteps: Tensor, observation: Tensor) -> Tensor:
         """h_k: timesteps (B,) int64, observation (B, To * feature) -> (B, C)   (Eq. 7)."""
-        half = self.timestep_dim // 2
-        exponents = torch.arange(half, device=observation.device) * (-math.log(10000) / (half - 1))
-        angles = timesteps[:, None] * exponents.exp()  # (B, timestep_dim / 2)
-        embedding = torch.cat([angles.sin(), angles.cos()], dim=-1)  # (B, timestep_dim)
+        embedding = sinusoids(timesteps, self.timestep_dim)  # (B, timestep_dim)
         embedding = self.timestep_mlp(embedding.to(observation.dtype))
         return self.condition_mlp(torch.cat([embedding, observation], dim=-1))
 
@@ -537,8 +542,8 @@ class DAMIPolicy(nn.Module):
             return None
         tokens = None
         if config.demo_encoder != "none":
-            demo = {"demo_points": demo_points, "demo_state": demo_state}
-            self.check_shapes(**demo, demo_action=demo_action)
+            parts = {"demo_state": demo_state, "demo_action": demo_action}
+            self.check_shapes(demo_points=demo_points, **parts)
             if (T := demo_points.shape[1]) > (most := config.demo_positions):
                 raise ValueError(f"a demonstration has {T} frames, the policy {most} positions")
             features = self.encode_observations(demo_points, demo_state)  # (D, T, feature)
@@ -594,10 +599,9 @@ class DAMIPolicy(nn.Module):
         context of D tasks, and the source of the initial noise. Returns (B, Ta, A), to be executed
         from the newest observation on, in the demonstrations' unit.
         """
-        config = self.config
         self.check_shapes(points=points, state=state)
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
-        shape = (len(points), config.horizon, config.action_dim)
+        shape = (len(points), self.config.horizon, self.config.action_dim)
         source = points.device if generator is None else generator.device
         actions = torch.randn(shape, generator=generator, device=source).to(points.device)
         for k in self.schedule.timesteps():
@@ -605,26 +609,28 @@ class DAMIPolicy(nn.Module):
             prediction = self.denoise(actions, timesteps, observation, context)  # (B, H, A)
             actions = self.schedule.step(prediction, k, actions)
 
-        newest = config.n_obs_steps - 1  # the action that belongs to the newest observation
-        chunk = actions[:, newest : newest + config.n_action_steps]  # (B, Ta, A)
+        return self.executed(actions)
+
+    def executed(self, actions: Tensor) -> Tensor:
+        """Normalized (B, H, A) -> (B, Ta, A) from the newest observation on, in their own unit."""
+        newest = self.config.n_obs_steps - 1
+        chunk = actions[:, newest : newest + self.config.n_action_steps]  # (B, Ta, A)
         return self.normalizer.unnormalize("action", chunk)
 
     def check_shapes(self, **inputs: Tensor) -> None:
         """Raises ValueError for shapes that would broadcast to a wrong result without an error."""
-        config, (B, T, *N, _) = self.config, next(iter(inputs.values())).shape  # of the clouds
-        expected = {
-            "points": (B, config.n_obs_steps, *N, 3),  # any number of points
-            "state": (B, config.n_obs_steps, config.state_dim),
-            "action": (B, config.horizon, config.action_dim),
-            "noise": (B, config.horizon, config.action_dim),
-            "timesteps": (B,),
-            "demo_points": (B, T, *N, 3),
-            "demo_state": (B, T, config.state_dim),
-            "demo_action": (B, T, config.action_dim),
-        }
+        expected = self.shapes(*next(iter(inputs.values())).shape[:-1])  # of the clouds
         for name, x in inputs.items():
             if x.shape != expected[name]:
                 raise ValueError(f"{name} is {tuple(x.shape)}, the policy takes {expected[name]}")
+
+    def shapes(self, B: int, T: int, *N: int) -> dict[str, tuple[int, ...]]:
+        """What each input's shape must be, for B clouds of T frames and any number of points."""
+        To, S, A = self.config.n_obs_steps, self.config.state_dim, self.config.action_dim
+        seen = {"points": (B, To, *N, 3), "state": (B, To, S)}
+        shown = {"demo_points": (B, T, *N, 3), "demo_state": (B, T, S), "demo_action": (B, T, A)}
+        chunk = (B, self.config.horizon, A)
+        return {**seen, **shown, "action": chunk, "noise": chunk, "timesteps": (B,)}
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
         """Draws what makes `loss` pure: noise (n, H, A) and timesteps (n,) int64."""

@@ -1071,7 +1071,7 @@ class Keys:
 
 def record(args: argparse.Namespace, settings: Settings) -> None:
     """Records demonstrations by hand guidance: the arm is free, keys begin and end an episode."""
-    if not re.fullmatch(r"\w[\w.-]{0,99}", args.task):
+    if not re.fullmatch(data.NAME, args.task):
         raise ValueError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
     out = Path(args.out or f"demos/{args.task}.npz")
     if out.exists() and not args.append:

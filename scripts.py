@@ -40,7 +40,7 @@ from tqdm import tqdm
 
 from baselines import PRESETS, build_policy
 from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
-from model import DAMIPolicy, PolicyConfig
+from model import CHOICES, DAMIPolicy, PolicyConfig
 
 # ---- Settings: each said once, as a field --------------------------------------------------------
 
@@ -184,7 +184,7 @@ def choose_config(
 ) -> PolicyConfig:
     """A preset's architecture with what was given, and with the dimensions of own recordings."""
     recordings = list(recorded.values())
-    names = ("demo_encoder", "tcfm", "num_points", "sampler")
+    names = (*CHOICES, "num_points")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     config = replace(PRESETS[args.policy or "dami"][preset], **given)
     if own:

@@ -61,7 +61,7 @@ class Settings(Flags):
     warmup: int = setting(500, "steps of linear warm-up", least=0)
     multi_task_share: float = setting(0.0, "first steps without an inner step", least=0, most=1)
     vectorize: int = setting(1, "tasks that run at once; memory is for so many", least=1)
-    after_success: int | None = setting(None, "frames that windows may begin later", least=0)
+    after_success: int | None = setting(None, "windows begin at most so much later", least=0)
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
     instruction_dropout: float = setting(0.0, "share of batches without it", least=0, most=1)
     backwards: float = setting(0.0, "share of batches played backwards", least=0, most=1)
@@ -323,16 +323,15 @@ def run(
     # Demonstrations and their windows, the policy, and the state in which the run was left
     n, rest = settings.demonstrations, settings.after_success
     recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
-    own = settings.suite == "own"
-    config = scripts.choose_config(args, settings.preset, recorded, own)
+    config = scripts.choose_config(args, settings.preset, recorded, settings.suite == "own")
 
     def windows(demonstrations: dict[str, Demonstrations]) -> dict[str, WindowSampler]:
         how = (config, device, rest, settings.augment)
         return {task: WindowSampler(d, *how) for task, d in demonstrations.items() if d is not None}
 
     samplers = windows(recorded)
-    reverse = settings.backwards > 0
-    undone = windows({task: backwards(d, rest or 0) for task, d in recorded.items() if reverse})
+    played = recorded if settings.backwards else {}
+    undone = windows({task: backwards(d, rest or 0) for task, d in played.items()})
     policy, ema, optimizer = initialize(config, settings, samplers, device)
     data = scripts.digest(samplers)
     left = {"step": 0, "seconds": 0.0, "text_weights": None}
@@ -362,9 +361,8 @@ def run(
         with stop.at_once():  # everything is saved
             return evaluate.evaluate_step(folder, step, paths, text, *protocol)
 
-    bar = {"desc": "training", "unit": "step", "disable": not leader}
-    bar |= {"total": settings.steps, "initial": start}
-    with scripts.StopRequest() as stop, progress_bar(**bar) as progress:
+    bar = {"desc": "training", "unit": "step", "total": settings.steps, "initial": start}
+    with scripts.StopRequest() as stop, progress_bar(**bar, disable=not leader) as progress:
         measure(start)  # the run may have been stopped while it was measured
         began = saved = time.monotonic()
         training = meta_train(
