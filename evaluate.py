@@ -32,7 +32,7 @@ import scripts
 from clip import text_features
 from data import WindowSampler, load_demonstrations, write_atomically
 from model import CHOICES, DAMIPolicy
-from scripts import command_line, load_checkpoint, run_jobs, worker, write_text
+from scripts import at_least, command_line, load_checkpoint, run_jobs, worker, write_text
 from simulator import MetaWorldPointCloudEnv, check_task, collect, evaluation_seed, suite_tasks
 
 EPISODES_A_JOB = 10  # side by side in one process; part of the protocol: it shapes the noise drawn
@@ -273,6 +273,7 @@ def evaluate(
     Returns:
         task -> E booleans, in the order of the episodes. They do not depend on `workers`.
     """
+    at_least(1, episodes=episodes)
     seeds = [evaluation_seed(seed, i) for i in range(episodes)]
     chunks = [seeds[i : i + EPISODES_A_JOB] for i in range(0, episodes, EPISODES_A_JOB)]
     jobs = [
@@ -516,9 +517,8 @@ def of_next_task(each: dict[str, Any]) -> dict[str, Any]:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    for name, least in {"demonstrations": 1, "episodes": 1, "top": 0}.items():
-        if (value := getattr(args, name)) < least:
-            raise ValueError(f"--{name} is {value}: use at least {least}")
+    at_least(1, demonstrations=args.demonstrations, episodes=args.episodes)
+    at_least(0, top=args.top)
     evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after collecting
     if args.gif and not (args.task and len(args.task) == 1 and args.gif.endswith(".gif")):
         raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")

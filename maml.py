@@ -74,8 +74,10 @@ def meta_gradient(
 
     Returns:
         (gradients, after, before): name -> tensor, and the query losses with the adapted parameters
-        and with the given ones, both (tasks,). Raises ValueError without a task.
+        and with the given ones, both (tasks,). Raises ValueError without a task, or `vectorize`.
     """
+    if vectorize < 1:
+        raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
     # If they required grad, autograd would record all of this once more, beneath torch.func.
     params = {name: p.detach() for name, p in params.items()}
 

@@ -78,10 +78,8 @@ class PolicyConfig:
         object.__setattr__(self, "pointnet_widths", tuple(self.pointnet_widths))
         object.__setattr__(self, "unet_widths", tuple(self.unet_widths))
 
-        if (
-            not (self.pointnet_widths and self.unet_widths)
-            or self.vmt_layers + self.u2t_layers > 99
-        ):
+        layers = self.vmt_layers + self.u2t_layers
+        if () in (self.pointnet_widths, self.unet_widths) or layers > 99:
             raise ValueError("each network needs a width, and VMT and U2T at most 99 layers")
         for name, value in vars(self).items():
             if isinstance(value, int) and not 1 <= value <= 100_000:
@@ -494,8 +492,7 @@ Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None:
 class DAMIPolicy(nn.Module):
     """The policy: two observations, an instruction and a demonstration in; eight actions out."""
 
-    # What baselines.py exchanges
-    demo_encoders: ClassVar = {"vmt": VisualMotorTrajectory}
+    demo_encoders: ClassVar = {"vmt": VisualMotorTrajectory}  # baselines.py exchanges both
     network = ConditionalUNet1d
 
     def __init__(self, config: PolicyConfig):

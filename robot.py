@@ -593,7 +593,8 @@ class RecordedCamera:
         try:
             with np.load(path, allow_pickle=False) as file:
                 depth, self.intrinsics = file["depth"], tuple(map(float, file["intrinsics"]))
-            assert depth.ndim == 3 and depth.size and depth.dtype == np.uint16, depth.dtype
+            if depth.ndim != 3 or not depth.size or depth.dtype != np.uint16:
+                raise TypeError(f"depth is {depth.dtype} {depth.shape}")
         except Exception as error:  # numpy and zipfile raise many types
             what = "no recorded camera: depth (F, H, W) uint16, intrinsics (4,) in an .npz file"
             raise ValueError(f"{path} is {what} ({error})") from None

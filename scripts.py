@@ -89,6 +89,13 @@ def add_common_flags(add: Callable[..., Any]) -> None:
     add("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as before, or download)")
 
 
+def at_least(least: int, **values: int | None) -> None:
+    """Raises ValueError, in the words of the command line, for a value below `least`."""
+    for name, value in values.items():
+        if value is not None and value < least:
+            raise ValueError(f"--{name} is {value}: use at least {least}")
+
+
 def choose(name: str, names: Iterable[str], what: str) -> str:
     """Returns `name` if it is one of `names`; otherwise ValueError with the nearest right one."""
     names = sorted(names)
@@ -587,8 +594,7 @@ def run_jobs(
         ValueError: `workers` is below 1, or a worker process was killed.
         Exception: what a job raised. By then the other jobs were stopped and no process is left.
     """
-    if workers is not None and workers < 1:
-        raise ValueError(f"--workers is {workers}: use at least 1")
+    at_least(1, workers=workers)
     if not jobs:
         return []
 

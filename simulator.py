@@ -29,7 +29,7 @@ from metaworld import env_dict
 from metaworld.policies import ENV_POLICY_MAP
 
 from data import Demonstrations, farthest_point_sample, load_demonstrations, save_demonstrations
-from scripts import choose, command_line, remove_temporaries, run_jobs, worker
+from scripts import at_least, choose, command_line, remove_temporaries, run_jobs, worker
 
 # Some experts ask for more than 1; their actions are clipped below.
 warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
@@ -486,8 +486,7 @@ def collect(
     Returns:
         task -> file.
     """
-    if episodes < 1:
-        raise ValueError(f"--episodes is {episodes}: use at least 1")
+    at_least(1, episodes=episodes)
     episode_seed(seed, 0)  # refuses a seed out of range
     paths = {check_task(task): Path(folder) / f"{task}.npz" for task in tasks}
     Path(folder).mkdir(parents=True, exist_ok=True)

@@ -330,8 +330,8 @@ def run(
         return {task: WindowSampler(d, *how) for task, d in demonstrations.items() if d is not None}
 
     samplers = windows(recorded)
-    played = recorded if settings.backwards else {}
-    undone = windows({task: backwards(d, rest or 0) for task, d in played.items()})
+    back = {t: backwards(d, rest or 0) for t, d in recorded.items()} if settings.backwards else {}
+    undone = windows(back)
     policy, ema, optimizer = initialize(config, settings, samplers, device)
     data = scripts.digest(samplers)
     left = {"step": 0, "seconds": 0.0, "text_weights": None}

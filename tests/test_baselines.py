@@ -388,7 +388,7 @@ def test_presets_are_of_one_size_and_the_table_counts_them(monkeypatch, capsys):
 # ---- Whole runs ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", NEW)
+@pytest.mark.parametrize("name", ["dp3", *NEW])
 def test_a_policy_is_trained_resumed_adapted_and_rolled_out(
     name, recorded, small_suite, own_folder, monkeypatch
 ):

@@ -217,6 +217,16 @@ def test_cuda_where_there_is_none_points_to_the_cpu(script, capsys):
     assert "--device cuda cannot be used here" in fails(script, ["--device", "cuda"], capsys)
 
 
+def test_a_policy_that_was_adapted_is_measured_on_its_task_alone(run, recorded, capsys):
+    info = torch.load(run / "ema-00006.pt", weights_only=True)
+    torch.save(info | {"adapted_to": "door-close"}, "adapted.pt")
+    argv = ["--data", recorded, "--demonstrations", "2", "--checkpoint"]
+    message = fails(evaluate, [*argv, "adapted.pt", "--task", "reach"], capsys)
+    assert "was adapted to door-close, not to reach" in message
+    message = fails(evaluate, [*argv, run, "adapted.pt"], capsys)
+    assert "adapted.pt was adapted to door-close: measure it alone" in message
+
+
 def test_a_policy_of_own_recordings_cannot_be_rolled_out(run, recorded, capsys):
     info = torch.load(run / "ema-00006.pt", weights_only=True)
     torch.save(info | {"suite": "own"}, "own.pt")
