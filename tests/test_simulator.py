@@ -318,14 +318,16 @@ def test_a_fault_in_one_process_ends_all(job, jobs, setup, error, message, capfd
 SLEEPERS = """
 import os, signal, sys, threading, time
 import scripts
-kill, target = {"SIGINT": (os.killpg, 0), "SIGKILL": (os.kill, os.getpid())}[sys.argv[1]]
+kill, target = (os.kill, os.getpid()) if sys.argv[1] == "SIGKILL" else (os.killpg, 0)
 threading.Timer(0.3, kill, (target, signal.Signals[sys.argv[1]])).start()
 sleepers = [(60,), (60,)]
 scripts.command_line(lambda: scripts.run_jobs(time.sleep, sleepers, 2, 2, "sleeping"))
 """
 
 
-@pytest.mark.parametrize("name, code", [("SIGINT", 130), ("SIGKILL", -signal.SIGKILL)])
+@pytest.mark.parametrize(
+    "name, code", [("SIGINT", 130), ("SIGHUP", 130), ("SIGKILL", -signal.SIGKILL)]
+)
 def test_ctrl_c_or_a_kill_while_workers_import_leaves_no_process_and_no_traceback(name, code):
     command = [sys.executable, "-c", SLEEPERS, name]
     process = subprocess.Popen(
@@ -337,7 +339,7 @@ def test_ctrl_c_or_a_kill_while_workers_import_leaves_no_process_and_no_tracebac
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == code and "Traceback" not in error
-    assert ("interrupted" in error) == (name == "SIGINT")
+    assert ("interrupted" in error) == (code == 130)
 
 
 # ---- Collecting ----------------------------------------------------------------------------------

@@ -410,10 +410,10 @@ def test_a_run_is_not_resumed_on_other_recordings(recorded, tmp_path, capsys):
         data.save_demonstrations(f"own/{task}-mine.npz", demonstrations)
     argv = ["--data", "own", *[word for word in FEW if word not in ("--suite", "ml10")]]
     train.main([*argv, "--steps", "2", "--out", "run"])
-    shifted = replace(demonstrations, action=-demonstrations.action)
-    data.save_demonstrations(f"own/{task}-mine.npz", shifted)
-    message = fails(train, [*argv, "--steps", "2", "--out", "run", "--resume"], capsys)
-    assert "was started on other recordings" in message
+    for change in ({"action": -demonstrations.action}, {"instruction": "Something else."}):
+        data.save_demonstrations(f"own/{task}-mine.npz", replace(demonstrations, **change))
+        message = fails(train, [*argv, "--steps", "2", "--out", "run", "--resume"], capsys)
+        assert "was started on other recordings" in message
 
 
 def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_last_good_state(
