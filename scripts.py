@@ -388,14 +388,14 @@ def restore(
     """Puts all three in the state of last.pt; returns the rest of it: step, seconds, text_weights.
 
     Raises ValueError if the run was started with other settings, or on other data (its digest).
-    Before the first inner step another --maml is no other setting.
+    What concerns the inner step alone may differ before the first one.
     """
     device = policy.normalizer.action_scale.device
     averaged, left = load_checkpoint(path, device, needs=("training", "data"))
     old = left["arguments"] | asdict(averaged.config)
     new = asdict(settings) | asdict(policy.config)
     if left["step"] <= old.get("multi_task_share", 0) * old["steps"]:
-        old["maml"] = new["maml"]
+        old |= {name: new[name] for name in ("maml", "inner_lr", "support_only")}
     changed = [f"{k} {old.get(k)} -> {new[k]}" for k in new if old.get(k) != new[k]]
     if changed:
         what = f"other settings ({', '.join(changed)})"

@@ -65,6 +65,7 @@ class Settings(Flags):
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
     instruction_dropout: float = setting(0.0, "share of batches without it", least=0, most=1)
     backwards: float = setting(0.0, "share of batches played backwards", least=0, most=1)
+    support_only: float = setting(0.0, "share of inner steps told nothing else", least=0, most=1)
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
@@ -79,8 +80,8 @@ SETTINGS = {
         preset="small", steps=10_000, support=4, query=12, lr=1e-3, warmup=100,
         multi_task_share=0.8,  # a quarter of the time a step, and nearly the same gradient
         after_success=20,  # three in five of the experts' frames are later
-        instruction_dropout=0.5, backwards=0.25,  # or the demonstration is not read
-        inner_lr=3e-3,  # at 1e-4 an inner step moves nothing
+        instruction_dropout=0.5,  # or the demonstration is not read
+        support_only=0.25, inner_lr=3e-2,  # or the inner step has nothing to say
         vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=10_000,
     ),
     "tiny": Settings(
@@ -106,23 +107,29 @@ def task_batch(
     seed: tuple[int, ...],
     settings: Settings,
     undone: WindowSampler | None = None,
+    inner: bool = False,
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
     Where the instruction names the task, nothing else need be read. In a share of the batches it
     is therefore left out (zeros). Another share comes from `undone`, the same episodes played
-    backwards, without it, too: a task that only the demonstration tells.
+    backwards, without it, too: a task that only the demonstration tells. And where an `inner` step
+    follows, a share has neither (zeros): then the support windows alone tell the task.
 
     Returns the keyword arguments of `policy.loss`. They follow from `seed` alone.
     """
     for_batch, for_shares = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     generator = torch.Generator().manual_seed(int(for_batch))
-    drop, turn = torch.rand(2, generator=torch.Generator().manual_seed(int(for_shares)))
+    drop, turn, hide = torch.rand(3, generator=torch.Generator().manual_seed(int(for_shares)))
     if undone is not None and turn < settings.backwards:
         sampler, text = undone, torch.zeros_like(text)
     elif drop < settings.instruction_dropout:
         text = torch.zeros_like(text)
     windows = sampler.batch(n, generator)
+    if inner and hide < settings.support_only:
+        shown = [name for name in windows if name not in PER_WINDOW]
+        windows |= {name: torch.zeros_like(windows[name]) for name in shown}
+        text = torch.zeros_like(text)
     return {"text": text[None], **windows, **policy.draw_noise_and_timesteps(n, generator)}
 
 
@@ -208,25 +215,28 @@ def meta_train(
     # Several tasks at once, if their demonstrations can be stacked.
     lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
     at_once = settings.vectorize if len(lengths) == 1 else 1
-    inner = {"lr": settings.inner_lr, "first_order": settings.maml == "first", "vectorize": at_once}
+    how = {"lr": settings.inner_lr, "first_order": settings.maml == "first", "vectorize": at_once}
 
     def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         return functional_call(policy, params, (), batch)
 
     for step in range(start, settings.steps):  # lines 2, 22
         # A generator: the inner loop below keeps the batches of `at_once` tasks in memory, not all.
+        inner = step >= multi_task_steps
         batches = (  # lines 3 to 6, 9
-            task_batch(policy, samplers[t], text[t], n, (seed, step, i), settings, undone.get(t))
+            task_batch(
+                policy, samplers[t], text[t], n, (seed, step, i), settings, undone.get(t), inner
+            )
             for i, t in my_tasks
         )
 
         # The gradient of the mean loss over my tasks
-        if step < multi_task_steps:
+        if not inner:
             gradients, losses = multi_task_gradient(policy, list(batches))
             figures = {}
         else:  # lines 4 to 19: the inner step on support, the gradient of the query loss through it
             pairs = (split(batch, settings.support) for batch in batches)
-            gradients, losses, before = meta_gradient(loss_fn, params, pairs, **inner)
+            gradients, losses, before = meta_gradient(loss_fn, params, pairs, **how)
             figures = {"loss_before": before.mean().item()}
         loss = losses.mean()
 
@@ -279,7 +289,7 @@ def main(argv: list[str] | None = None) -> None:
     suite = "own" if own else choose(args.suite or "ml10", SUITES, "suite")
     settings, policy = SETTINGS[preset], args.policy or "dami"
     if policy != "dami" or args.demo_encoder == "none":  # the instruction alone tells the task
-        settings = replace(settings, instruction_dropout=0.0, backwards=0.0)
+        settings = replace(settings, instruction_dropout=0.0, backwards=0.0, support_only=0.0)
     settings = settings.given(args, suite=suite)
     name = preset if policy == "dami" else f"{policy}-{preset}"
     if own:  # all demonstrations unless told otherwise, and no simulator to be rolled out in

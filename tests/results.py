@@ -41,6 +41,7 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-no-inner-loop": "without the inner loop",
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
+    "ml10-scratch": "from random weights",
     "before": "before: the instruction always told, inner rate 1e-4",
     "before-no-inner-loop": "before, without the inner loop",
 }
@@ -222,6 +223,39 @@ def draw_swap(results: dict, path: Path) -> None:
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
 
 
+def draw_adaptation(results: dict, path: Path) -> None:
+    """Success on novel tasks against gradient steps, and against the number of demonstrations."""
+    from matplotlib.figure import Figure
+
+    shots = [(n, f"{n}-shot", "after") for n in (1, 3, 5)] + [(10, "curve", "200 steps")]
+    steps = [(0, "curve", "before"), *((n, "curve", f"{n} steps") for n in (1, 5, 20, 50, 200))]
+    panels = {"gradient steps, ten demonstrations": [*steps, (1000, "curve", "after")]}
+    panels["demonstrations, 200 gradient steps"] = shots
+    figure = Figure(figsize=(8, 3.8), layout="constrained")
+    for axes, (label, points) in zip(figure.subplots(1, 2, sharey=True), panels.items()):
+        for variant, title in VARIANTS.items():
+            curve = []
+            for run in runs_of(results, variant)[:1]:
+                curve = [(x, measured(run, report, column)) for x, report, column in points]
+            curve = [(x, [s for e in found.values() for s in e]) for x, found in curve if found]
+            if not curve:
+                continue
+            bounds = [wilson_interval(sum(e), len(e)) for _, e in curve]
+            rates = np.array([np.mean(e) for _, e in curve])
+            error = 100 * np.abs(np.array(bounds).T - rates)  # (2, points)
+            line = {"marker": "o", "markersize": 4, "capsize": 2, "linewidth": 1.5}
+            axes.errorbar([x for x, _ in curve], 100 * rates, error, label=title, **line)
+        axes.set_xscale("symlog", linthresh=1)
+        axes.set_xticks([x for x, *_ in points], [x for x, *_ in points])
+        axes.minorticks_off()
+        axes.set(xlabel=label, ylim=(0, 100))
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel("success on novel tasks, %")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, ncols=2, loc="outside upper center", fontsize=8)
+    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
+
+
 def draw_by_task(results: dict, path: Path) -> None:
     """Success by task, of all seeds together, beside the paper's."""
     episodes: Successes = {task: [] for task in BASE + NOVEL}
@@ -254,6 +288,7 @@ def main(words: list[str]) -> None:
         write_atomically(ROOT / name, lambda path, filled=filled: path.write_text(filled))
     draw_swap(results, ROOT / "assets" / "swap.png")
     draw_by_task(results, ROOT / "assets" / "success.png")
+    draw_adaptation(results, ROOT / "assets" / "adaptation.png")
 
 
 if __name__ == "__main__":

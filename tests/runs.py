@@ -34,20 +34,28 @@ VARIANTS = {
     "up": "--tcfm up",
     "baseline": "--demo-encoder mlp --tcfm none",
     "vmt": "--tcfm none",
+    "scratch": "--maml off --warmup 10000 --steps 1",  # at a rate of 1e-7: a policy of chance
 }
 VARIANTS |= {policy: f"--policy {policy} --maml off" for policy in ("dp3", "flow", "mamba", "freq")}
 VARIANTS |= {f"{policy}-maml": f"--policy {policy}" for policy in ("dp3", "flow", "mamba", "freq")}
 
 SEED = 1  # of the evaluation's goals: that of no training, and of no choice that was made
 EPISODES = 100
-REPORTS = {  # name -> command; {run} is the run's folder
-    "base": "evaluate.py --checkpoint {run}",
-    "novel": "finetune.py --task novel --checkpoint {run}",
-    "told": "evaluate.py --checkpoint {run} --swap demonstration instruction",
-    "swap": "evaluate.py --checkpoint {run} --without instruction --swap demonstration",
-    "one-shot": "evaluate.py --checkpoint {run} --split novel --without instruction",
-    "alone": "finetune.py --task novel --checkpoint {run} --no-instruction",
+READS = ("dami", "no-inner-loop")  # a demonstration: may go without the instruction
+SHOWN = (*READS, "neither", "scratch")
+REPORTS = {  # name -> command, of which variants (all: ()); {run} is the run's folder
+    "base": ("evaluate.py --checkpoint {run}", ()),
+    "novel": ("finetune.py --task novel --checkpoint {run}", ()),
+    "told": ("evaluate.py --checkpoint {run} --swap demonstration instruction", READS),
+    "swap": ("evaluate.py --checkpoint {run} --without instruction --swap demonstration", READS),
+    "one-shot": ("evaluate.py --checkpoint {run} --split novel --without instruction", READS),
+    "alone": ("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
 }
+# Along the adaptation, and with fewer demonstrations: 20 episodes, not told where that can be.
+CURVE = {"curve": "--steps 1000 --curve 1 5 20 50 200"}
+CURVE |= {f"{n}-shot": f"--demonstrations {n}" for n in (1, 3, 5)}
+for name, flags in CURVE.items():
+    REPORTS[name] = (f"finetune.py --task novel --checkpoint {{run}} --episodes 20 {flags}", SHOWN)
 
 
 @dataclass(frozen=True)
@@ -74,15 +82,17 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
     flags = f"--suite {suite} --preset small --seed {seed} --episodes 0 --out {run}"
     flags += f" --steps {steps} --clip-weights random {VARIANTS[variant]}"
     resume = " --resume" if (run / "last.pt").exists() else ""
-    last = run / f"ema-{steps:05d}.pt"
+    last = run / f"ema-{1 if variant == 'scratch' else steps:05d}.pt"
     listed = [Job(f"train.py {flags}{resume}", last, run.with_suffix(".log"))]
-    for name, command in REPORTS.items():
-        if variant != "dami" and name in ("told", "swap", "one-shot", "alone"):
-            continue  # of interest only where a demonstration is read
+    for name, (command, variants) in REPORTS.items():
+        if variants and variant not in variants:
+            continue
         out = Path(f"{run}-{name}")
-        measured = f"{command.format(run=run)} --seed {SEED} --episodes {episodes} --workers 1"
-        measured += f" --out {out} --overwrite"
-        listed.append(Job(measured, out / "success.json", run.with_suffix(".log")))
+        script, words = command.format(run=run).split(" ", 1)
+        measured = f"{script} --episodes {episodes} {words} --seed {SEED} --workers 1 --out {out}"
+        if name in CURVE and variant in READS:
+            measured += " --no-instruction"
+        listed.append(Job(f"{measured} --overwrite", out / "success.json", run.with_suffix(".log")))
     return listed
 
 

@@ -36,8 +36,9 @@ def test_runs_are_of_the_variants_that_they_name():
     for name, run in HELD.items():
         variant, seed = re.fullmatch(r"(?:ml10-)?(.*)-seed(\d)", name).groups()
         arguments, config = run["training"]["arguments"], run["training"]["config"]
-        assert arguments["seed"] == int(seed) and arguments["steps"] == 10_000
-        off = variant.endswith("inner-loop") or variant == "neither"
+        steps = 1 if variant == "scratch" else 10_000
+        assert arguments["seed"] == int(seed) and arguments["steps"] == steps
+        off = variant.endswith("inner-loop") or variant in ("neither", "scratch")
         assert (arguments["maml"] == "off") == off
         silent = config["demo_encoder"] == "none"
         assert silent == (variant in ("no-demonstration", "neither"))
