@@ -11,6 +11,8 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,7 +21,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from clip import text_features
 from data import Demonstrations, WindowSampler, farthest_point_sample, load_demonstrations
-from evaluate import EPISODES_A_JOB, SHIPPED_CHECKPOINT, rollout
+from evaluate import EPISODES_A_JOB, SHIPPED_CHECKPOINT, TRAINED, checkpoints_of, rollout
 from finetune import BATCH, LEARNING_RATES, adapt_policy
 from maml import adapt, meta_gradient
 from model import PRESETS, DAMIPolicy, PolicyConfig
@@ -211,20 +213,21 @@ def peak_memory(tasks: int) -> float:
     )
 
 
-def inner_step_table(folder: str, seeds: int = 5) -> None:
-    """What an inner step does to the policy that ships: 4 + 12 windows of each base task, as in its
-    training, seeds 0 to 4.
+def inner_step_table(checkpoint: Path, folder: str, rate: float | None, seeds: int = 5) -> None:
+    """What an inner step does to a policy: windows of each task as in its training, seeds 0 to 4.
 
-    Once with the mean over a window's H x A numbers, as DP3 and this code have it, once with their
-    sum, as the paper writes the loss: an inner rate H x A times as large.
+    First at the rate of its training, on base and on novel tasks, by what the policy is shown. Then
+    on base tasks with the mean over a window's H x A numbers, as DP3 and this code have it, and
+    with their sum, as the paper writes the loss: an inner rate H x A times as large.
     """
-    policy, info = load_checkpoint(SHIPPED_CHECKPOINT)
-    tasks, trained = suite_tasks("ml10")[0], info["arguments"]
-    recorded = [load_demonstrations(path) for path in collect(tasks, folder).values()]
+    policy, info = load_checkpoint(checkpoint, needs=TRAINED)
+    (base, novel), trained = suite_tasks("ml10"), info["arguments"]
+    recorded = [load_demonstrations(path) for path in collect(base + novel, folder).values()]
     text, _ = text_features([d.instruction for d in recorded], None, info["text_weights"])
     windows = trained["after_success"], trained["augment"]
     samplers = [WindowSampler(d, policy.config, "cpu", *windows) for d in recorded]
     params = {name: p.detach() for name, p in policy.named_parameters()}
+    n = trained["support"] + trained["query"]
 
     def loss_fn(params: dict[str, torch.Tensor], batch: dict[str, torch.Tensor]) -> torch.Tensor:
         return functional_call(policy, params, (), batch)
@@ -232,6 +235,33 @@ def inner_step_table(folder: str, seeds: int = 5) -> None:
     def change(new: dict[str, torch.Tensor], old: dict[str, torch.Tensor]) -> float:
         new, old = (torch.cat([x.flatten() for x in each.values()]) for each in (new, old))
         return ((new - old).norm() / old.norm()).item()
+
+    def pairs_of(seed: int, split_: str, **shares: float) -> list[tuple[dict, dict]]:
+        how = Settings(**shares), None, True
+        of_tasks = slice(len(base)) if split_ == "base" else slice(len(base), None)
+        batches = [
+            task_batch(policy, sampler, feature, n, (seed, 0, index), *how)
+            for index, (sampler, feature) in enumerate(list(zip(samplers, text))[of_tasks])
+        ]
+        return [split(batch, trained["support"]) for batch in batches]
+
+    rate = trained["inner_lr"] if rate is None else rate
+    print(f"\n{checkpoint}: query loss before -> after an inner step at {rate:g}, means\n")
+    print("| the policy is shown | base tasks | novel tasks |\n|---|---|---|")
+    for shown, shares in {
+        "instruction, demonstration": {},
+        "demonstration": {"instruction_dropout": 1.0},
+        "nothing but the support windows": {"support_only": 1.0},
+    }.items():
+        cells = []
+        for split_ in ("base", "novel"):
+            losses = []
+            for support, query in chain(*(pairs_of(s, split_, **shares) for s in range(seeds))):
+                adapted = adapt(loss_fn, params, support, rate)
+                with torch.no_grad():
+                    losses.append([loss_fn(p, query).item() for p in (params, adapted)])
+            cells.append("{:.4f} -> {:.4f}".format(*np.mean(losses, axis=0)))
+        print(f"| {shown} | {' | '.join(cells)} |", flush=True)
 
     print("\n| inner step at 1e-4 on the | weights | support loss | query loss | meta-gradient |")
     print("|---|---|---|---|---|")
@@ -241,12 +271,7 @@ def inner_step_table(folder: str, seeds: int = 5) -> None:
     }.items():
         lr, moved, losses, gradient = 1e-4 * numbers, [], [], []
         for seed in range(seeds):
-            n = trained["support"] + trained["query"]
-            batches = [
-                task_batch(policy, sampler, feature, n, (seed, 0, index), Settings())
-                for index, (sampler, feature) in enumerate(zip(samplers, text))
-            ]
-            pairs = [split(batch, trained["support"]) for batch in batches]
+            pairs = pairs_of(seed, "base")
             for support, query in pairs:
                 adapted = adapt(loss_fn, params, support, lr)
                 moved.append(change(adapted, params))
@@ -318,10 +343,11 @@ def main(argv: list[str] | None = None) -> None:
         action="store_true",
         help="the ratios at the paper's size too (10 minutes more, 16 GB)",
     )
-    parser.add_argument(
-        "--inner-step", action="store_true", help="only what it does to the shipped policy"
-    )
+    parser.add_argument("--inner-step", action="store_true", help="only what it does to a policy")
     parser.add_argument("--data", default="data", help="demonstrations that --inner-step reads")
+    parser.add_argument(
+        "--checkpoint", default=SHIPPED_CHECKPOINT, help="its policy, or run folder"
+    )
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--device")
     parser.add_argument("--peak-memory", type=int, help=argparse.SUPPRESS)
@@ -336,7 +362,7 @@ def main(argv: list[str] | None = None) -> None:
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
         return
     if args.inner_step:
-        return inner_step_table(args.data)
+        return inner_step_table(checkpoints_of(args.checkpoint)[-1], args.data, args.inner_lr)
     threads = torch.get_num_threads()
     print(
         f"{hardware(device)}, torch {torch.__version__}, {threads} threads, "
