@@ -21,6 +21,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from torch import Tensor
 
 import scripts
 from clip import text_features
-from data import WindowSampler, load_demonstrations, write_atomically
+from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
 from model import CHOICES, DAMIPolicy
 from scripts import at_least, command_line, load_checkpoint, run_jobs, worker, write_text
 from simulator import MetaWorldPointCloudEnv, check_task, collect, evaluation_seed, suite_tasks
@@ -205,6 +206,98 @@ def sample_chunks(
     return policy.sample_actions(points, state, context, generator).cpu().numpy()
 
 
+# ---- Without a simulator: held-out episodes ------------------------------------------------------
+
+
+def hold_out(
+    recorded: dict[str, Demonstrations], n: int
+) -> tuple[dict[str, Demonstrations], dict[str, Demonstrations]]:
+    """Parts each recording, by task, into all but its last n episodes, and those; n = 0: no others.
+
+    Raises ValueError where nothing would be left to train on.
+    """
+    kept, held = {}, {}
+    for task, whole in recorded.items():
+        if n and n >= len(whole):
+            raise ValueError(f"{task} has {len(whole)} episodes: use a --held-out below that")
+        kept[task] = whole.take(len(whole) - n)
+        if n:
+            start, meta = len(kept[task].points), dict(whole.meta)
+            if "success_frames" in meta:
+                meta["success_frames"] = meta["success_frames"][len(kept[task]) : len(whole)]
+            parts = {part: getattr(whole, part)[start:] for part in ("points", "state", "action")}
+            ends = whole.episode_ends[-n:] - start
+            held[task] = replace(whole, **parts, episode_ends=ends, meta=meta)
+    return kept, held
+
+
+@torch.no_grad()
+def action_error(
+    policy: DAMIPolicy, shown: WindowSampler, unseen: WindowSampler, text: Tensor, seed: int = 0
+) -> tuple[float, float]:
+    """How far drawn actions are from an expert's: mean absolute error, in the action's unit.
+
+    Episodes are gone through as in a rollout, from one executed chunk of Ta actions to the next,
+    but the policy sees the expert's frames: so errors do not add up. The mean is over episodes'
+    chunks, their Ta steps and the A numbers of an action.
+
+    Args:
+        policy: in any mode.
+        shown: the episodes trained on; one of them is the reference demonstration.
+        unseen: the episodes to judge by.
+        text: instruction feature, (text_dim,).
+        seed: of references and noise.
+
+    Returns:
+        The error, and that of always doing the mean action of `shown`, to compare it with.
+    """
+    generator, errors, plain = torch.Generator().manual_seed(seed), [], []
+    newest, Ta = policy.config.n_obs_steps - 1, policy.config.n_action_steps
+    for episode in range(len(unseen.episodes)):
+        demo = shown.demonstration(shown.draw_episode(generator))
+        context = policy.encode_demo(text[None], **demo)
+        windows = unseen.gather((unseen.episode_of == episode).nonzero()[::Ta, 0])
+        done = windows["action"][:, newest : newest + Ta]  # (n, Ta, A)
+        seen = windows["points"], windows["state"]
+        drawn = policy.sample_actions(*seen, context, generator)  # (n, Ta, A)
+        errors.append((drawn - done).abs().flatten())
+        plain.append((shown.action.mean(dim=0) - done).abs().flatten())
+    return torch.cat(errors).mean().item(), torch.cat(plain).mean().item()
+
+
+def judge(
+    folder: Path,
+    step: int,
+    policy: DAMIPolicy,
+    shown: dict[str, WindowSampler],
+    unseen: dict[str, WindowSampler],
+    text: dict[str, Tensor],
+) -> str:
+    """Logs the action errors on held-out episodes, of which there may be none.
+
+    Returns a table, also in held-out.md: a row a task, the errors at the first and last step that
+    was judged so far, and those of always doing the mean action.
+    """
+    if not unseen:
+        return ""
+    found = {task: action_error(policy, shown[task], unseen[task], text[task]) for task in unseen}
+    errors = {task: error for task, (error, _) in found.items()}
+    mean = float(np.mean(list(errors.values())))
+    scripts.log(folder, step=step, action_error=mean, action_errors=errors)
+
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    columns = {line["step"]: line["action_errors"] for line in lines if "action_errors" in line}
+    columns = {f"step {k}": columns[k] for k in sorted({min(columns), step})}
+    columns["the mean action"] = {task: error for task, (_, error) in found.items()}
+    rows = [[task, *(f"{errors[task]:.4f}" for errors in columns.values())] for task in found]
+    if len(rows) > 1:
+        means = [f"{np.mean(list(errors.values())):.4f}" for errors in columns.values()]
+        rows.append(["**mean**", *means])
+    table = format_table([["held-out action error", *columns], *rows])
+    write_text(folder / "held-out.md", f"{table}\n\nMean absolute error, in the action's unit.\n")
+    return table
+
+
 # ---- Evaluation in worker processes --------------------------------------------------------------
 
 loaded: dict[str, Any] = {}  # what a worker process keeps between jobs: policy and environments
@@ -315,6 +408,14 @@ def paper_success(suite: str | None, task: str) -> float | None:
     return None
 
 
+def format_table(rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, the first row its head, whose columns are aligned in a terminal too."""
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    rows = [rows[0], ["-" * width for width in widths], *rows[1:]]
+    filled = [[cell.ljust(width) for cell, width in zip(row, widths)] for row in rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in filled)
+
+
 def success_table(columns: dict[str, Successes], suite: str | None = None) -> str:
     """A Markdown table: a row a task, a column for each set of results, the paper's; the mean."""
     tasks = list(next(iter(columns.values())))
@@ -394,7 +495,9 @@ def draw_curves(folder: Path) -> None:
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     steps = np.array([line["step"] for line in lines if "loss" in line])
     losses = np.array([line["loss"] for line in lines if "loss" in line])
-    evaluated = [(line["step"], line["success"]) for line in lines if "success" in line]
+    of = {"success": "mean success on base tasks, %", "action_error": "held-out action error"}
+    measured = {name: [(line["step"], line[name]) for line in lines if name in line] for name in of}
+    name = "success" if measured["success"] else "action_error"
 
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots()
@@ -405,12 +508,12 @@ def draw_curves(folder: Path) -> None:
     axes.set(xlabel="outer step", ylabel="loss (actions in [-1, 1])", yscale="log")
     axes.spines["top"].set_visible(False)
     handles, labels = axes.get_legend_handles_labels()
-    if evaluated:
+    if measured[name]:
         right = axes.twinx()
-        (line,) = right.plot(*zip(*evaluated), "o-", color="C1")
-        right.set(ylabel="mean success on base tasks, %", ylim=(0, 100))
+        (line,) = right.plot(*zip(*measured[name]), "o-", color="C1")
+        right.set(ylabel=of[name], ylim=(0, 100 if name == "success" else None))
         right.spines["top"].set_visible(False)
-        handles, labels = [*handles, line], [*labels, "success (right)"]
+        handles, labels = [*handles, line], [*labels, f"{name.replace('_', ' ')} (right)"]
     axes.legend(handles, labels, frameon=False)
 
     path = folder / "curves.png"

@@ -47,6 +47,7 @@ class Settings(Flags):
     instruction: bool = setting(True, "--no-instruction: adapt and roll out without it")
     normalizer: str = setting("fit", "to the task, or `keep` the suite's", choices=("fit", "keep"))
     demonstrations: int | None = setting(None, "how many (default: 10; of a file all)", least=1)
+    held_out: int = setting(0, "of them, the last so many only judge (default: 0)", least=0)
     episodes: int = setting(20, "rollouts before and after (default: 20)", least=0)
     seed: int = setting(0, "of batches, noise and goals (default: 0)", least=0, most=999)
 
@@ -118,8 +119,15 @@ def adapt_checkpoint(
     """
     policy, info = load_checkpoint(checkpoint, text.device, needs=evaluate.TRAINED)
     demonstrations = load_demonstrations(data).take(settings.demonstrations)
-    trained, device = info["arguments"], text.device
-    sampler = WindowSampler(demonstrations, policy.config, device, trained.get("after_success"))
+    trained, device, task = info["arguments"], text.device, demonstrations.task
+    how = policy.config, device, trained.get("after_success")
+    shown, unseen = (
+        {task: WindowSampler(part[task], *how) for task in part}
+        for part in evaluate.hold_out({task: demonstrations}, settings.held_out)
+    )
+    sampler, judged_by = shown[task], (shown, unseen, {task: text})
+    scripts.rewind_metrics(folder, 0)
+    evaluate.judge(folder, 0, policy, *judged_by)
     if settings.normalizer == "fit":
         policy.normalizer.fit(sampler.points, sampler.state, sampler.action)  # line 3
 
@@ -130,11 +138,10 @@ def adapt_checkpoint(
     batch = settings.batch or BATCH[info["preset"]]
     used = asdict(settings) | {"batch": batch, "learning_rates": rates}
     about = {name: info[name] for name in evaluate.TRAINED} | {"adaptation": used}
-    about |= {"adapted_to": demonstrations.task, "instruction": demonstrations.instruction}
+    about |= {"adapted_to": task, "instruction": demonstrations.instruction}
 
-    scripts.rewind_metrics(folder, 0)
     seconds, began = 0.0, time.monotonic()
-    bar = {"desc": f"adapting to {demonstrations.task}", "unit": "step"}
+    bar = {"desc": f"adapting to {task}", "unit": "step"}
     training = adapt_policy(policy, sampler, text, settings.steps, batch, rates, settings.seed)
     with progress_bar(total=settings.steps, **bar) as progress:
         for step, loss, adapted in training:
@@ -147,6 +154,8 @@ def adapt_checkpoint(
             began = time.monotonic()
 
     save_checkpoint(folder / "adapted.pt", adapted, **about)
+    table = evaluate.judge(folder, settings.steps, adapted, *judged_by)
+    print(table, end="\n" if table else "", flush=True)
     written = {"checkpoint": str(checkpoint), "data": str(data), **used, "seconds": seconds}
     scripts.write_text(folder / "config.json", json.dumps(written, indent=1))
     return written

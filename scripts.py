@@ -392,7 +392,7 @@ def restore(
     """
     device = policy.normalizer.action_scale.device
     averaged, left = load_checkpoint(path, device, needs=("training", "data"))
-    old = left["arguments"] | asdict(averaged.config)
+    old = asdict(type(settings)()) | left["arguments"] | asdict(averaged.config)
     new = asdict(settings) | asdict(policy.config)
     if left["step"] <= old.get("multi_task_share", 0) * old["steps"]:
         old["maml"] = new["maml"]
@@ -411,7 +411,7 @@ def restore(
 
 # ---- Folders of runs -----------------------------------------------------------------------------
 
-RESULTS = "adapted.pt", "adapted-*.pt", "success.json", "success.md", "success.png"
+RESULTS = "adapted.pt", "adapted-*.pt", "success.json", "success.md", "success.png", "held-out.md"
 OF_ADAPTING = "config.json", "metrics.jsonl"
 
 
@@ -515,6 +515,16 @@ class StopRequest:
         self.requested, before = True, self.requested
         yield
         self.requested = before
+
+
+def say_finished(folder: Path, suite: str) -> None:
+    """The last lines of a training: errors on held-out episodes, its files, and what is next."""
+    if (judged := folder / "held-out.md").exists():
+        print(f"\n{judged.read_text().rstrip()}")
+    files = ", ".join(sorted(path.name for path in folder.iterdir()))
+    task = "--data NEW.npz" if suite == "own" else f"--task novel --suite {suite}"
+    print(f"\n{folder} is finished: {files}")
+    print(f"next: python finetune.py {task} --checkpoint {shlex.quote(str(folder))}")
 
 
 def log(folder: Path, **values: Any) -> None:

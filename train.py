@@ -66,6 +66,7 @@ class Settings(Flags):
     instruction_dropout: float = setting(0.0, "share of batches without it", least=0, most=1)
     backwards: float = setting(0.0, "share of batches played backwards", least=0, most=1)
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
+    held_out: int = setting(0, "of them, the last so many only judge", least=0)
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
     episodes: int = setting(20, "evaluation episodes a task; 0: never evaluate", least=0)
@@ -329,7 +330,8 @@ def run(
         how = (config, device, rest, settings.augment)
         return {task: WindowSampler(d, *how) for task, d in demonstrations.items() if d is not None}
 
-    samplers = windows(recorded)
+    recorded, held = evaluate.hold_out(recorded, settings.held_out)
+    samplers, unseen = windows(recorded), windows(held)
     back = {t: backwards(d, rest or 0) for t, d in recorded.items()} if settings.backwards else {}
     undone = windows(back)
     policy, ema, optimizer = initialize(config, settings, samplers, device)
@@ -357,7 +359,7 @@ def run(
         due = step == settings.steps or (step and step % settings.evaluate_every == 0)
         if not leader or not settings.episodes or not due:
             return None
-        protocol = (settings.episodes, EVALUATION_SEED, args.workers, device, n)
+        protocol = (settings.episodes, EVALUATION_SEED, args.workers, device, n - settings.held_out)
         with stop.at_once():  # everything is saved
             return evaluate.evaluate_step(folder, step, paths, text, *protocol)
 
@@ -388,6 +390,7 @@ def run(
             if stop.requested and step < settings.steps:
                 raise KeyboardInterrupt(f"saved after step {step}, add --resume to go on")
             if leader and milestone:
+                evaluate.judge(folder, step, ema.module, samplers, unseen, text)
                 evaluate.draw_curves(folder)
                 measure(step)
             began = time.monotonic()
@@ -403,8 +406,7 @@ def run(
         columns = {"last checkpoint": successes}
         print(f"\n{evaluate.write_report(folder, columns, facts, settings.suite)}")
     if leader:
-        files = ", ".join(sorted(path.name for path in folder.iterdir()))
-        print(f"\n{folder} is finished: {files}")
+        scripts.say_finished(folder, settings.suite)
 
 
 if __name__ == "__main__":

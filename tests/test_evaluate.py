@@ -1,6 +1,7 @@
 """Tests of evaluate.py: figures, which checkpoint, rollouts, the policy that ships, bad input."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from conftest import BASE, fails
 
 import clip
+import data
 import evaluate
 import finetune
 import model
@@ -238,3 +240,71 @@ def test_a_command_ends_quietly_or_in_one_line(capsys):
     with pytest.raises(SystemExit) as end:
         scripts.command_line(lambda: (_ for _ in ()).throw(KeyboardInterrupt()))
     assert end.value.code == 130
+
+
+# ---- Held-out episodes ---------------------------------------------------------------------------
+
+
+def numbered(lengths, frames=None):
+    """A recording whose actions tell the episode and the frame: 10 e + 0.01 t."""
+    counts = [np.full(n, 10 * e) + 0.01 * np.arange(n) for e, n in enumerate(lengths)]
+    action = np.repeat(np.concatenate(counts)[:, None], 4, axis=1).astype(np.float32)
+    points = np.random.default_rng(0).normal(size=(len(action), 64, 3)).astype(np.float16)
+    state = np.zeros((len(action), 9), np.float32)
+    meta = {} if frames is None else {"success_frames": frames}
+    ends = np.cumsum(lengths)
+    return data.Demonstrations("stir", "Stir.", points, state, action, ends, meta)
+
+
+def test_the_last_episodes_are_held_out():
+    recorded = numbered([30, 20, 40, 25], frames=[1, 2, 3, 4]).take(3)
+    kept, held = evaluate.hold_out({"stir": recorded}, 2)
+    assert kept["stir"].episode_ends.tolist() == [30] and len(kept["stir"].action) == 30
+    assert held["stir"].episode_ends.tolist() == [20, 60] and held["stir"].problem() is None
+    assert held["stir"].meta["success_frames"] == [2, 3]
+    np.testing.assert_array_equal(held["stir"].action, recorded.action[30:90])
+    assert evaluate.hold_out({"stir": recorded}, 0)[1] == {}
+    with pytest.raises(ValueError, match="stir has 3 episodes: use a --held-out below that"):
+        evaluate.hold_out({"stir": recorded}, 3)
+
+
+def test_the_action_error_is_the_mean_absolute_error_over_executed_chunks(monkeypatch):
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    kept, held = evaluate.hold_out({"stir": numbered([30, 40, 12])}, 2)
+    shown, unseen = (data.WindowSampler(part["stir"], policy.config) for part in (kept, held))
+    shown_to, drawn = [], []
+
+    def draw(points, state, context, generator):
+        shown_to.append(context)
+        drawn.append(torch.full((len(points), 8, 4), 10.5))
+        return drawn[-1]
+
+    monkeypatch.setattr(policy, "sample_actions", draw)
+    monkeypatch.setattr(policy, "encode_demo", lambda text, demo_action, **_: demo_action)
+    error, plain = evaluate.action_error(policy, shown, unseen, torch.zeros(512))
+    # Episode 1: chunks at 0, 8, 16, 24, 32; episode 2 has 12 frames: one window, from frame 0.
+    first, second = 10 + 0.01 * np.arange(40), 20 + 0.01 * np.arange(8)
+    assert [len(chunks) for chunks in drawn] == [5, 1]
+    actions = np.concatenate([first, second])
+    assert error == pytest.approx(np.abs(actions - 10.5).mean(), rel=1e-4)
+    assert plain == pytest.approx(np.abs(actions - 0.01 * 14.5).mean(), rel=1e-4)
+    assert all((demo < 10).all() for demo in shown_to)  # an episode that was trained on
+
+
+def test_a_policy_that_fits_its_demonstrations_has_a_small_action_error():
+    """A policy that has learned one episode draws it; an untrained one does not."""
+    config = replace(model.PRESETS["tiny"], demo_encoder="none", tcfm="none", inference_steps=2)
+    torch.manual_seed(0)
+    policy, recorded = model.DAMIPolicy(config), numbered([40, 40])
+    recorded.state[:] = np.linspace(-1, 1, 40).repeat(1)[np.arange(80) % 40][:, None]
+    recorded.points[40:], recorded.action[40:] = recorded.points[:40], recorded.action[:40]
+    kept, held = evaluate.hold_out({"stir": recorded}, 1)
+    shown, unseen = (data.WindowSampler(part["stir"], config) for part in (kept, held))
+    policy.normalizer.fit(shown.points, shown.state, shown.action)
+    before, plain = evaluate.action_error(policy, shown, unseen, torch.zeros(512))
+    adapting = finetune.adapt_policy(
+        policy, shown, torch.zeros(512), 150, 32, dict.fromkeys(finetune.LEARNING_RATES, 3e-3)
+    )
+    *_, (_, _, adapted) = adapting
+    after, _ = evaluate.action_error(adapted, shown, unseen, torch.zeros(512))
+    assert after < 0.3 * plain < before

@@ -343,6 +343,48 @@ def test_own_recordings_of_any_length_and_dimension_are_trained_on_and_adapted_t
     assert "base tasks" not in capsys.readouterr().out
 
 
+def test_held_out_episodes_only_judge(capsys):
+    Path("own").mkdir()
+    for task in ("stir", "pour"):
+        np.savez(f"own/{task}.npz", **own_recording(90, ends=[60, 90], task=task))
+    argv = "--preset tiny --steps 2 --checkpoint-every 1 --data own --clip-weights random".split()
+    train.main([*argv, "--out", "runs/judged", "--held-out", "1"])
+    assert "held-out action error" in capsys.readouterr().out
+    train.main([*argv, "--out", "runs/first", "--demonstrations", "1"])
+    judged, first = (whole_state(Path(f"runs/{name}")) for name in ("judged", "first"))
+    assert same_bits(judged, first)
+
+    folder = Path("runs/judged")
+    lines = [line for line in metrics(folder) if "action_error" in line]
+    assert [line["step"] for line in lines] == [1, 2]
+    for line in lines:
+        assert line["action_errors"].keys() == {"stir", "pour"}
+        assert line["action_error"] == pytest.approx(np.mean([*line["action_errors"].values()]))
+    table = (folder / "held-out.md").read_text()
+    assert re.search(r"\| held-out action error +\| step 1 +\| step 2 +\| the mean action", table)
+    assert f"{lines[1]['action_errors']['stir']:.4f}" in table
+    message = fails(train, [*argv, "--out", "runs/none", "--held-out", "2"], capsys)
+    assert "has 2 episodes: use a --held-out below that" in message
+
+    options = "--checkpoint runs/judged --held-out 1 --steps 2".split()
+    finetune.main(["--data", "own/stir.npz", *options])
+    lines = metrics(Path("runs/finetune/stir-seed0"))
+    assert [line["step"] for line in lines if "action_error" in line] == [0, 2]
+    assert "| step 0" in capsys.readouterr().out
+
+
+def test_a_run_of_an_older_version_which_lacks_a_setting_is_resumed(run, recorded, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    last = torch.load(run / "last.pt", weights_only=True)
+    del last["arguments"]["held_out"]
+    torch.save(last, tmp_path / "run" / "last.pt")
+    options = "--episodes 2 --evaluate-every 6".split()
+    argv = [*FEW, *options, "--data", str(recorded), "--out", str(tmp_path / "run")]
+    train.main([*argv, "--resume"])
+    with pytest.raises(ValueError, match="held_out 0 -> 1"):
+        train.main([*argv, "--resume", "--held-out", "1"])
+
+
 # ---- Bad input -----------------------------------------------------------------------------------
 
 
