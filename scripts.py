@@ -39,7 +39,7 @@ from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
 from baselines import PRESETS, build_policy
-from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
+from data import Demonstrations, WindowSampler, write_atomically
 from model import CHOICES, DAMIPolicy, PolicyConfig
 
 # ---- Settings: each said once, as a field --------------------------------------------------------
@@ -258,25 +258,6 @@ def draw_demonstration(
     title = f"{demonstrations.task}, episode {episode}: {demonstrations.instruction}"
     figure.suptitle(title.replace("$", r"\$"))  # no formula
     write_atomically(out, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
-
-
-def parse_show(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Draws a recording of demonstrations.")
-    parser.add_argument("--show", metavar="FILE", required=True, help="draw an episode of it")
-    parser.add_argument("--episode", type=int, default=0, help="which (default: 0, the first)")
-    parser.add_argument("--out", help="the picture (default: FILE with .png)")
-    return parser.parse_args(argv)
-
-
-def show(argv: list[str] | None = None) -> None:
-    """The command line of data.py."""
-    args = parse_show(argv)
-    out = Path(args.out or args.show).with_suffix(".png")
-    recorded = load_demonstrations(args.show)
-    if not 0 <= args.episode < len(recorded):
-        raise ValueError(f"{args.show} holds episodes 0 to {len(recorded) - 1}, not {args.episode}")
-    draw_demonstration(recorded, out, args.episode)
-    print(f"wrote {out}")
 
 
 # ---- Checkpoints ---------------------------------------------------------------------------------
