@@ -23,7 +23,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -119,9 +119,29 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
 # ---- Rollouts ------------------------------------------------------------------------------------
 
 
+class Environment(Protocol):
+    """What `rollout` asks of a simulator: Meta-World's, or your own with these three methods.
+
+    An observation holds "point_cloud" (N, 3) and "agent_pos" (S,), both float32, as the policy was
+    trained on them. simulator.RayCastCamera makes clouds of any MuJoCo model.
+    """
+
+    def reset(self, *, seed: int) -> tuple[dict[str, np.ndarray], dict]:
+        """Begins the episode of a seed; returns (observation, info)."""
+
+    def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
+        """Takes one step with an action (A,); returns (reward, truncated, {"success": bool}).
+
+        After a success, or `truncated`, it is not called again.
+        """
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """The observation of the present moment."""
+
+
 def rollout(
     policy: DAMIPolicy,
-    envs: Sequence[MetaWorldPointCloudEnv],
+    envs: Sequence[Environment],
     seeds: Sequence[int],
     sampler: WindowSampler,
     text: Tensor,
@@ -136,7 +156,7 @@ def rollout(
 
     Args:
         policy: in evaluation mode.
-        envs, seeds: E environments and the seeds of their goals.
+        envs, seeds: E simulators, see `Environment`, and the seeds of their goals.
         sampler: of the task's demonstrations, from which one a rollout is drawn.
         text: instruction feature, (text_dim,).
         generator: draws demonstrations and noise; on the CPU.

@@ -28,7 +28,7 @@ from clip import text_features
 from data import WindowSampler, load_demonstrations
 from model import DAMIPolicy, ema_model
 from scripts import Flags, command_line, load_checkpoint, progress_bar, save_checkpoint, setting
-from simulator import INSTRUCTIONS, check_task, collect, suite_tasks
+from simulator import check_task, collect, is_simulated, suite_tasks
 
 LEARNING_RATES = {"vision": 1e-5, "diffusion": 3e-5, "other": 1e-4}  # AdamW's, by part
 PAPER_LEARNING_RATE = 1e-4  # of the meta-training that they belong to
@@ -188,15 +188,16 @@ def main(argv: list[str] | None = None) -> None:
     file = Path(args.data) if args.data.endswith(".npz") else None
     if args.task is None and file is None:
         raise ValueError("name a task of Meta-World with --task, or a recording with --data")
+    simulated = True
     if file is not None:
-        tasks = [load_demonstrations(file).task]
+        recorded = load_demonstrations(file)
+        tasks, simulated = [recorded.task], is_simulated(recorded, file)
         if args.task not in (None, tasks):
             raise ValueError(f"{file} is a recording of {tasks[0]}, not of {args.task[0]}")
     elif args.task == ["novel"]:
         tasks = suite_tasks(args.suite)[1]
     else:
         tasks = [check_task(task) for task in args.task]
-    simulated = all(task in INSTRUCTIONS for task in tasks)
     start = args.checkpoint or evaluate.default_checkpoint(args.suite if simulated else "own")
     checkpoint = evaluate.checkpoints_of(start)[-1]
     _, info = load_checkpoint(checkpoint, needs=evaluate.TRAINED)

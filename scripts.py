@@ -175,17 +175,6 @@ def report_facts(
 OWN_FRAMES = 500  # the paper's positions on the real robot
 
 
-def own_recordings(folder: str | Path, others: Iterable[str]) -> dict[str, Path]:
-    """Task -> file of the recordings in a folder, if none is of a task among `others`; else {}."""
-    if not Path(folder).is_dir():
-        raise ValueError(f"there is no folder {folder}: with --suite ml10, experts fill it")
-    paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
-    known = sorted(set(paths) & set(others))
-    if known and len(known) < len(paths):
-        raise ValueError(f"{folder} mixes your recordings with {known[0]}: move one kind elsewhere")
-    return {} if known else paths
-
-
 def choose_config(
     args: argparse.Namespace, preset: str, recorded: dict[str, Demonstrations], own: bool
 ) -> PolicyConfig:

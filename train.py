@@ -37,7 +37,7 @@ from data import Demonstrations, WindowSampler, backwards, load_demonstrations
 from maml import meta_gradient
 from model import CHOICES, PRESETS, DAMIPolicy, PolicyConfig, ema_model
 from scripts import Flags, choose, command_line, progress_bar, save_checkpoint, setting
-from simulator import INSTRUCTIONS, SUITES, collect, suite_tasks
+from simulator import SUITES, collect, own_recordings, suite_tasks
 
 # ---- Settings ------------------------------------------------------------------------------------
 
@@ -274,7 +274,7 @@ def main(argv: list[str] | None = None) -> None:
     device = scripts.pick_device(args.device)
     own = {}  # task -> file
     if args.data and not args.suite:
-        own = scripts.own_recordings(args.data, INSTRUCTIONS)
+        own = own_recordings(args.data)
     default = "paper" if device.type == "cuda" else "small"
     preset = choose(args.preset or default, PRESETS, "preset")
     suite = "own" if own else choose(args.suite or "ml10", SUITES, "suite")

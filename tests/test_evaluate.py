@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -191,6 +192,87 @@ def test_a_rollout_can_be_watched(run, recorded, monkeypatch, capsys):
     assert Path("reach.gif").read_bytes().startswith(b"GIF8")
     assert Path("reach.gif").stat().st_size > 10_000
     assert "wrote reach.gif" in capsys.readouterr().out
+
+
+TABLE = """
+<mujoco>
+  <worldbody>
+    <camera name="corner" pos="0 -1 1" xyaxes="1 0 0 0 1 1" fovy="50"/>
+    <geom name="table" type="box" pos="0 0 -0.02" size="1 1 0.01"/>
+    <body name="hand">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="y" type="slide" axis="0 1 0"/>
+      <geom type="sphere" size="0.08" pos="0 0 0.1" mass="1"/>
+    </body>
+    <site name="goal" type="sphere" size="0.05" pos="0 0 0.1" rgba="1 0 0 1"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+class Table:
+    """A hand on a table, in MuJoCo but not in Meta-World: the three methods of `Environment`."""
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(TABLE)
+        self.data = mujoco.MjData(self.model)
+        box = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.3))
+        self.camera = simulator.RayCastCamera(self.model, 40, box, "corner")
+
+    def reset(self, *, seed):
+        mujoco.mj_resetData(self.model, self.data)
+        self.steps, self.goal = 0, np.random.default_rng(seed).uniform(0.2, 0.3, 2)
+        self.model.site("goal").pos[:2] = self.goal
+        return self.observe(), {}
+
+    def advance(self, action):
+        self.data.qpos += 0.02 * np.clip(action, -1, 1)
+        self.steps += 1
+        near = bool(np.abs(self.data.qpos - self.goal).max() < 0.03)
+        return 0.0, self.steps >= 40, {"success": near}
+
+    def observe(self):
+        mujoco.mj_forward(self.model, self.data)
+        cloud = data.farthest_point_sample(self.camera.points(self.data), 64)
+        return {"point_cloud": cloud, "agent_pos": self.data.qpos.astype(np.float32)}
+
+
+def test_your_own_simulator_is_rolled_out_in(monkeypatch):
+    env: evaluate.Environment = Table()
+    frames, ends = [], [20, 40]
+    for seed in (0, 1):
+        observation, _ = env.reset(seed=seed)
+        for _ in range(20):
+            action = (50 * (env.goal - observation["agent_pos"])).clip(-1, 1)
+            frames.append((observation["point_cloud"], observation["agent_pos"], action))
+            env.advance(action)
+            observation = env.observe()
+    points, state, action = (np.stack(x).astype(np.float32) for x in zip(*frames))
+    recorded = data.Demonstrations("go", "Go there.", points, state, action, np.array(ends), {})
+    assert recorded.problem() is None
+    goals = points[points[..., 0] > 0.12]  # not the hand where it begins, but the marker
+    assert len(goals) and np.abs(goals[:, 2] - 0.1).max() < 0.15
+
+    policy = model.DAMIPolicy(replace(model.PRESETS["tiny"], state_dim=2, action_dim=2))
+    sampler, text = data.WindowSampler(recorded, policy.config), torch.zeros(512)
+    envs, seen = [Table(), Table()], []
+
+    def rollout():
+        generator = torch.Generator().manual_seed(0)
+        watch = lambda e, observation: seen.append(observation["agent_pos"])  # noqa: E731
+        return evaluate.rollout(policy, envs, [5, 6], sampler, text, generator, watch)
+
+    assert all(type(success) is bool for success in rollout())
+    assert all(env.steps <= 40 for env in envs) and seen
+
+    def toward(points, state, context, generator):
+        goals = torch.tensor(np.array([env.goal for env in envs])).float()
+        return (50 * (goals - state[:, -1])).clip(-1, 1)[:, None].expand(-1, 8, -1)
+
+    monkeypatch.setattr(policy, "sample_actions", toward)
+    assert rollout() == [True, True] and all(env.steps < 40 for env in envs)
+    monkeypatch.setattr(policy, "sample_actions", lambda *a: -toward(*a))
+    assert rollout() == [False, False] and all(env.steps == 40 for env in envs)
 
 
 # ---- Bad input -----------------------------------------------------------------------------------

@@ -443,6 +443,12 @@ def test_what_cannot_be_resumed_is_said(run, recorded, tmp_path, capsys):
         shutil.copy(recorded / "reach.npz", f"mixed/{name}.npz")
     message = fails(train, ["--preset", "tiny", "--data", "mixed"], capsys)
     assert "mixes your recordings with reach" in message
+    Path("alone").mkdir()
+    np.savez("alone/hammer.npz", **own_recording(task="hammer", state_dim=7))
+    for script, data_ in ((train, "alone"), (finetune, "alone/hammer.npz")):
+        message = fails(script, ["--data", data_], capsys)
+        assert "alone/hammer.npz is not Meta-World's hammer as recorded here: give your" in message
+    assert [path.name for path in Path("alone").iterdir()] == ["hammer.npz"]
 
 
 def test_a_run_is_not_resumed_on_other_recordings(recorded, tmp_path, capsys):
