@@ -2,7 +2,7 @@
 
     python evaluate.py                                       # base tasks, the newest run
     python evaluate.py --checkpoint runs/a runs/b --top 5    # all checkpoints of two runs
-    python evaluate.py --task reach --gif reach.gif          # watch one rollout
+    python evaluate.py --task reach --gif reach.gif          # watch one rollout (.mp4 too)
     python evaluate.py --without instruction --swap demonstration    # is the demonstration read?
 
 An episode succeeds if any of its 200 steps reports success, so a rollout ends there. Each rollout
@@ -19,9 +19,11 @@ N points, A action dim, S state dim.
 import argparse
 import json
 import math
+import shlex
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,12 +32,28 @@ import torch
 from torch import Tensor
 
 import scripts
-from clip import text_features
 from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
 from model import CHOICES, DAMIPolicy
-from scripts import at_least, command_line, load_checkpoint, run_jobs, worker, write_text
-from simulator import MetaWorldPointCloudEnv, check_task, collect, evaluation_seed, suite_tasks
+from scripts import (
+    at_least,
+    checkpoints_of,
+    command_line,
+    format_table,
+    load_checkpoint,
+    run_jobs,
+    worker,
+    write_text,
+)
+from simulator import (
+    SUITES,
+    MetaWorldPointCloudEnv,
+    check_task,
+    collect,
+    evaluation_seed,
+    suite_tasks,
+)
 
+EVALUATION_SEED = 0  # of the goals; the same for every seed of training
 EPISODES_A_JOB = 10  # side by side in one process; part of the protocol: it shapes the noise drawn
 PAPER_RESULTS = Path(__file__).parent / "assets" / "paper_results.json"
 SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
@@ -83,16 +101,6 @@ def mean_interval(values: Sequence[float]) -> str:
 
 
 # ---- What to measure, and on what ----------------------------------------------------------------
-
-
-def checkpoints_of(path: str | Path) -> list[Path]:
-    """A file as it is; of a run's folder all its EMA checkpoints, the last one last."""
-    path = Path(path)
-    if not path.is_dir():
-        return [path]
-    if not (found := sorted(path.glob("ema-*.pt")) or sorted(path.glob("adapted.pt"))):
-        raise ValueError(f"{path} holds no checkpoint: name a folder of train.py, or a .pt file")
-    return found
 
 
 def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
@@ -428,29 +436,27 @@ def paper_success(suite: str | None, task: str) -> float | None:
     return None
 
 
-def format_table(rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, the first row its head, whose columns are aligned in a terminal too."""
-    widths = [max(map(len, column)) for column in zip(*rows)]
-    rows = [rows[0], ["-" * width for width in widths], *rows[1:]]
-    filled = [[cell.ljust(width) for cell, width in zip(row, widths)] for row in rows]
-    return "\n".join(f"| {' | '.join(row)} |" for row in filled)
+def parts_of(tasks: Sequence[str], suite: str | None) -> dict[str, list[str]]:
+    """What to call the mean, and of which tasks; base and novel ones of a suite are told apart."""
+    split = zip(("base", "novel"), suite_tasks(suite) if suite in SUITES else ((), ()))
+    parts = {f"mean of {part}": [t for t in tasks if t in known] for part, known in split}
+    whole = all(parts.values()) and sum(map(len, parts.values())) == len(tasks)
+    return parts if whole else {"mean": list(tasks)}
 
 
 def success_table(columns: dict[str, Successes], suite: str | None = None) -> str:
-    """A Markdown table: a row a task, a column for each set of results, the paper's; the mean."""
+    """A Markdown table: a row a task, a column for each set of results, the paper's; the means."""
+
+    def row(name: str, tasks: Sequence[str]) -> list[str]:
+        cells = [pooled_success({t: results[t] for t in tasks}) for results in columns.values()]
+        known = [paper_success(suite, task) for task in tasks]
+        return [name, *cells, "" if None in known else f"{np.mean(known):.1f}"]
+
     tasks = list(next(iter(columns.values())))
-    paper = {task: paper_success(suite, task) for task in tasks}
-    lines = [f"| task | {' | '.join(columns)} | paper |", "|---" * (len(columns) + 2) + "|"]
-    for task in tasks:
-        cells = [pooled_success({task: results[task]}) for results in columns.values()]
-        known = "" if paper[task] is None else f"{paper[task]:.1f}"
-        lines.append(f"| {task} | {' | '.join(cells)} | {known} |")
+    rows = [["task", *columns, "paper"], *(row(task, [task]) for task in tasks)]
     if len(tasks) > 1:
-        cells = [pooled_success(results) for results in columns.values()]
-        known = [value for value in paper.values() if value is not None]
-        mean = f"{np.mean(known):.1f}" if len(known) == len(tasks) else ""
-        lines.append(f"| **mean** | {' | '.join(cells)} | {mean} |")
-    return "\n".join(lines)
+        rows += [row(f"**{name}**", part) for name, part in parts_of(tasks, suite).items()]
+    return format_table(rows)
 
 
 def draw_success(
@@ -508,6 +514,31 @@ def write_report(
     return table
 
 
+def report_training(
+    folder: Path,
+    arguments: Any,
+    policy: str,
+    seconds: float,
+    facts: dict[str, Any],
+    successes: Successes | None,
+) -> None:
+    """What stands at the end of a training: curves, success or held-out errors, what is next."""
+    draw_curves(folder)
+    if successes:
+        facts = facts | {"title": f"{arguments.suite}, base tasks, {arguments.preset}, {policy}"}
+        facts |= {"episodes a task": arguments.episodes, "seed": EVALUATION_SEED}
+        facts |= {"training": f"{seconds / 60:.1f} min", "training seed": arguments.seed}
+        columns = {"last checkpoint": successes}
+        print(f"\n{write_report(folder, columns, facts, arguments.suite)}")
+    if (judged := folder / "held-out.md").exists():
+        print(f"\n{judged.read_text().rstrip()}")
+    files = ", ".join(sorted(path.name for path in folder.iterdir()))
+    suite = arguments.suite
+    new = "--data NEW.npz" if suite == "own" else f"--task novel --suite {suite}"
+    print(f"\n{folder} is finished: {files}")
+    print(f"next: python finetune.py {new} --checkpoint {shlex.quote(str(folder))}")
+
+
 def draw_curves(folder: Path) -> None:
     """Draws curves.png of a run: the query loss, its running mean, and success where measured."""
     from matplotlib.figure import Figure
@@ -550,19 +581,22 @@ def write_gif(
 
     Returns whether the episode succeeded.
     """
-    from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.animation import FuncAnimation
     from matplotlib.figure import Figure
 
+    writer = movie_writer(path)
     env = MetaWorldPointCloudEnv(sampler.task, policy.config.num_points, render_mode="rgb_array")
     frames = []
 
     def on_chunk(_: int, observation: dict) -> None:
         frames.append((env.render(), observation["point_cloud"]))
+        progress.update()
 
     goal = evaluation_seed(seed, 0)
     generator = torch.Generator().manual_seed(goal)
-    (success,) = rollout(policy, [env], [goal], sampler, text, generator, on_chunk)
-    on_chunk(0, env.observe())  # how it ended
+    with scripts.progress_bar(desc="rolling out", unit="chunk") as progress:
+        (success,) = rollout(policy, [env], [goal], sampler, text, generator, on_chunk)
+        on_chunk(0, env.observe())  # how it ended
 
     clouds = np.concatenate([cloud for _, cloud in frames])
     low, high = clouds.min(0), clouds.max(0)
@@ -587,8 +621,33 @@ def write_gif(
 
     shown = [*range(len(frames)), len(frames) - 1, len(frames) - 1]  # the end stays a while
     animation = FuncAnimation(figure, draw, frames=shown)
-    write_atomically(path, lambda name: animation.save(name, writer=PillowWriter(fps=8), dpi=70))
+    with scripts.progress_bar(desc="drawing", unit="frame", total=len(shown)) as progress:
+        how = {"writer": writer, "dpi": 70, "progress_callback": lambda *_: progress.update()}
+        write_atomically(path, lambda name: animation.save(name, **how))
     return success
+
+
+def movie_writer(path: str | Path) -> Any:
+    """What writes a .gif, or an .mp4 where there is ffmpeg, or the package imageio-ffmpeg with it.
+
+    Raises ValueError for any other file, one of no folder, or where there is neither.
+    """
+    import matplotlib
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    path, problem = Path(path), "name it .gif or .mp4"
+    if not path.resolve().parent.is_dir():
+        problem = "there is no such folder"
+    elif path.suffix == ".gif":
+        return PillowWriter(fps=8)
+    elif path.suffix == ".mp4":
+        with suppress(ImportError):
+            ffmpeg = import_module("imageio_ffmpeg").get_ffmpeg_exe()
+            matplotlib.rcParams["animation.ffmpeg_path"] = ffmpeg
+        if FFMpegWriter.isAvailable():
+            return FFMpegWriter(fps=8)
+        problem = "install ffmpeg or `pip install imageio-ffmpeg`, or name it .gif"
+    raise ValueError(f"cannot write {path}: {problem}")
 
 
 # ---- Command line --------------------------------------------------------------------------------
@@ -615,7 +674,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
     scripts.add_common_flags(add)
-    add("--gif", metavar="FILE", help="write one rollout of --task as an animation instead")
+    add("--gif", metavar="FILE", help="animate one rollout instead, .gif or .mp4")
     return parser.parse_args(argv)
 
 
@@ -643,10 +702,8 @@ def main(argv: list[str] | None = None) -> None:
     at_least(1, demonstrations=args.demonstrations, episodes=args.episodes)
     at_least(0, top=args.top)
     evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after collecting
-    if args.gif and not (args.task and len(args.task) == 1 and args.gif.endswith(".gif")):
-        raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
-    if args.gif and not Path(args.gif).resolve().parent.is_dir():
-        raise ValueError(f"there is no folder to write {args.gif} into")
+    if args.gif:
+        movie_writer(args.gif)  # refuses a wrong name now
     device = scripts.pick_device(args.device)
 
     # Which checkpoints: of each run the last, or all of them for the mean of the best
@@ -666,6 +723,11 @@ def main(argv: list[str] | None = None) -> None:
     # Tasks, their demonstrations and instructions
     suite = args.suite or info["suite"]
     tasks = choose_tasks(args, suite, info)
+    if args.gif and len(tasks) > 1:
+        raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
+    if args.gif and "adapted_to" not in info and tasks[0] in suite_tasks(suite)[1]:
+        adapt = f"python finetune.py --task {tasks[0]}"
+        print(f"{tasks[0]} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
     if args.swap and (len(tasks) < 2 or args.top):
         raise ValueError("--swap needs the tasks of a split, and the last checkpoint alone")
     for checkpoint in labels:
@@ -679,13 +741,12 @@ def main(argv: list[str] | None = None) -> None:
         if not args.gif:
             scripts.claim_folder(out, args.overwrite)
         paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
-        recorded = [load_demonstrations(path).take(args.demonstrations) for path in paths.values()]
-        said = [demonstrations.instruction for demonstrations in recorded]
-        features, identity = text_features(said, args.clip_weights, info["text_weights"])
-        text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
+        n, how = args.demonstrations, (args.clip_weights, info["text_weights"], device)
+        recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
+        text, identity = scripts.instruction_features(recorded, *how)
 
         if args.gif:
-            sampler = WindowSampler(recorded[0], policy.config, device)
+            sampler = WindowSampler(recorded[tasks[0]], policy.config, device)
             success = write_gif(policy, sampler, text[tasks[0]], args.seed, args.gif)
             print(f"{tasks[0]}: {'success' if success else 'failure'}; wrote {args.gif}")
             return
@@ -725,11 +786,13 @@ def measure(
             label = f"{labels[checkpoint]}, {part} of another task"
             swapped[label] = evaluate(checkpoint, *inputs.values(), *protocol)
 
-    means = [[mean_success(results[checkpoint]) for checkpoint in run] for run in runs]
-    facts["mean, last checkpoint"] = mean_interval([run[-1] for run in means])
-    if args.top:
-        best = [float(np.mean(sorted(run)[-args.top :])) for run in means]
-        facts[f"mean, best {args.top} checkpoints"] = mean_interval(best)
+    for name, part in parts_of(list(paths), suite).items():
+        of_part = {path: {task: found[task] for task in part} for path, found in results.items()}
+        means = [[mean_success(of_part[path]) for path in run] for run in runs]
+        facts[f"{name}, last checkpoint"] = mean_interval([run[-1] for run in means])
+        if args.top:
+            best = [float(np.mean(sorted(run)[-args.top :])) for run in means]
+            facts[f"{name}, best {args.top} checkpoints"] = mean_interval(best)
     columns = {labels[run[-1]]: results[run[-1]] for run in runs} | swapped
     all_checkpoints = {labels[path]: found for path, found in results.items()} if args.top else None
     print(f"\n{write_report(Path(args.out), columns, facts, suite, all_checkpoints)}\n")

@@ -24,7 +24,6 @@ from torch import Tensor
 
 import evaluate
 import scripts
-from clip import text_features
 from data import WindowSampler, load_demonstrations
 from model import DAMIPolicy, ema_model
 from scripts import Flags, command_line, load_checkpoint, progress_bar, save_checkpoint, setting
@@ -40,7 +39,7 @@ class Settings(Flags):
     """What an adaptation is made of; each field is a flag. None: as the preset has it."""
 
     steps: int = setting(200, "gradient steps (default: 200)", least=1)
-    batch: int | None = setting(None, "windows a step (default: the preset's)", least=1)
+    batch: int | None = setting(None, f"windows a step (default: {BATCH})", least=1)
     lr_vision: float | None = setting(None, "learning rate of the observation encoder", least=0)
     lr_diffusion: float | None = setting(None, "learning rate of the U-Net", least=0)
     lr_other: float | None = setting(None, "learning rate of VMT and U2T", least=0)
@@ -121,10 +120,8 @@ def adapt_checkpoint(
     demonstrations = load_demonstrations(data).take(settings.demonstrations)
     trained, device, task = info["arguments"], text.device, demonstrations.task
     how = policy.config, device, trained.get("after_success")
-    shown, unseen = (
-        {task: WindowSampler(part[task], *how) for task in part}
-        for part in evaluate.hold_out({task: demonstrations}, settings.held_out)
-    )
+    parts = evaluate.hold_out({task: demonstrations}, settings.held_out)
+    shown, unseen = (scripts.windows(part, *how) for part in parts)
     sampler, judged_by = shown[task], (shown, unseen, {task: text})
     scripts.rewind_metrics(folder, 0)
     evaluate.judge(folder, 0, policy, *judged_by)
@@ -137,6 +134,7 @@ def adapt_checkpoint(
     rates = {p: lr * scale if given[p] is None else given[p] for p, lr in LEARNING_RATES.items()}
     batch = settings.batch or BATCH[info["preset"]]
     used = asdict(settings) | {"batch": batch, "learning_rates": rates}
+    scripts.print_settings(used, asdict(Settings()))
     about = {name: info[name] for name in evaluate.TRAINED} | {"adaptation": used}
     about |= {"adapted_to": task, "instruction": demonstrations.instruction}
 
@@ -199,7 +197,7 @@ def main(argv: list[str] | None = None) -> None:
     else:
         tasks = [check_task(task) for task in args.task]
     start = args.checkpoint or evaluate.default_checkpoint(args.suite if simulated else "own")
-    checkpoint = evaluate.checkpoints_of(start)[-1]
+    checkpoint = scripts.checkpoints_of(start)[-1]
     _, info = load_checkpoint(checkpoint, needs=evaluate.TRAINED)
     where = f"{device} ({scripts.hardware(device)})"
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {where}", flush=True)
@@ -217,9 +215,9 @@ def main(argv: list[str] | None = None) -> None:
         paths = {tasks[0]: file}
         if file is None:
             paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
-        said = [load_demonstrations(paths[task]).instruction for task in tasks]
-        features, identity = text_features(said, args.clip_weights, info["text_weights"])
-        text = dict(zip(tasks, features.to(device) * settings.instruction))  # each (text_dim,)
+        recorded = {task: load_demonstrations(paths[task]) for task in tasks}
+        how = args.clip_weights, info["text_weights"], device
+        text, identity = scripts.instruction_features(recorded, *how, told=settings.instruction)
 
         # Each task before, in between if asked for, and after
         between = sorted({step for step in args.curve if 0 < step < settings.steps})

@@ -96,7 +96,6 @@ class PolicyConfig:
             (self.horizon, shrink, "horizon by 2 for each level of the U-Net but the last"),
             (self.diffusion_steps, self.inference_steps, "diffusion_steps by inference_steps"),
             (self.kernel_size + 1, 2, "kernel_size + 1 by 2 (use an odd one)"),
-            (self.timestep_dim, 2, "timestep_dim by 2"),
             (self.demo_dim, self.vmt_heads, "demo_dim by vmt_heads"),
             (self.condition_dim, self.u2t_heads, "condition width by u2t_heads"),
             (math.gcd(*self.unet_widths), self.n_groups, "U-Net widths by n_groups"),

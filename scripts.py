@@ -5,8 +5,9 @@ step at hand, work is shared among processes. Skip this file when reading the me
 """
 
 import argparse
+import atexit
 import difflib
-import fcntl
+import functools
 import hashlib
 import json
 import math
@@ -39,8 +40,15 @@ from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
 from baselines import PRESETS, build_policy
+from clip import text_features
 from data import Demonstrations, WindowSampler, write_atomically
 from model import CHOICES, DAMIPolicy, PolicyConfig
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    print("error: this needs Linux or macOS; on Windows, run it under WSL", file=sys.stderr)
+    sys.exit(2)
 
 # ---- Settings: each said once, as a field --------------------------------------------------------
 
@@ -63,20 +71,59 @@ class Flags:
                 raise ValueError(f"--{f.name.replace('_', '-')} is {value}: use {limit}")
 
     @classmethod
-    def add_flags(cls, parser: Any) -> None:
-        """Adds a flag for each field; one that is not given is None."""
+    def add_flags(cls, parser: Any, presets: dict[str, "Flags"] | None = None) -> None:
+        """Adds a flag for each field, which tells each preset's value; None if it is not given."""
         for f in fields(cls):
             kind = next((t for t in get_args(f.type) if t is not type(None)), f.type)
             if kind is bool:
                 options = {"action": argparse.BooleanOptionalAction}
             else:
                 options = {"type": kind, "choices": f.metadata.get("choices")}
-            parser.add_argument(f"--{f.name.replace('_', '-')}", help=f.metadata["help"], **options)
+            shown = "" if f.name in ("suite", "preset") else of_presets(presets or {}, f.name)
+            help = f.metadata["help"] + shown
+            parser.add_argument(f"--{f.name.replace('_', '-')}", help=help, **options)
 
     def given(self, args: argparse.Namespace, **more: Any) -> Any:
         """Returns these settings with what was given on the command line, and `more`."""
         flags = {f.name: getattr(args, f.name) for f in fields(self)} | more
         return replace(self, **{name: value for name, value in flags.items() if value is not None})
+
+
+def of_presets(presets: dict[str, Any], name: str) -> str:
+    """` (paper 20, small 4, tiny 4)`, or ` (20)` where all have it: an attribute's values."""
+    values = {preset: getattr(settings, name) for preset, settings in presets.items()}
+    if len(set(values.values())) > 1:
+        return f" ({', '.join(f'{preset} {value}' for preset, value in values.items())})"
+    return f" ({next(iter(values.values()))})" if values else ""
+
+
+def add_architecture_flags(parser: argparse.ArgumentParser) -> None:
+    """Adds the flags of what `choose_config` makes a policy's configuration of."""
+    add = parser.add_argument_group("architecture (default: the preset's)").add_argument
+    presets = PRESETS["dami"]
+    for name, choices in CHOICES.items():
+        help = f"see model.PolicyConfig{of_presets(presets, name)}"
+        add(f"--{name.replace('_', '-')}", choices=choices, help=help)
+    points = f"points of each cloud that the policy reads{of_presets(presets, 'num_points')}"
+    add("--num-points", type=int, help=points)
+
+
+def format_table(rows: Sequence[Sequence[Any]]) -> str:
+    """A Markdown table, the first row its head, whose columns are aligned in a terminal too."""
+    rows = [[str(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    rows.insert(1, ["-" * width for width in widths])
+    filled = [[cell.ljust(width) for cell, width in zip(row, widths)] for row in rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in filled)
+
+
+def print_settings(used: dict[str, Any], default: dict[str, Any]) -> None:
+    """A table of what a run is made of, and of what that would be by default."""
+    rows = [
+        [name, value, "" if default.get(name, value) == value else default[name]]
+        for name, value in used.items()
+    ]
+    print(format_table([["setting", "value", "default"], *rows]), flush=True)
 
 
 # ---- Command lines -------------------------------------------------------------------------------
@@ -197,6 +244,27 @@ def choose_config(
     return config
 
 
+def windows(recorded: dict[str, Demonstrations | None], *how: Any) -> dict[str, WindowSampler]:
+    """The windows of each task that there is a recording of; `how` as WindowSampler takes it."""
+    return {task: WindowSampler(d, *how) for task, d in recorded.items() if d is not None}
+
+
+def instruction_features(
+    recorded: dict[str, Demonstrations],
+    weights: str | None,
+    identity: str | None,
+    device: str | torch.device,
+    told: bool = True,
+) -> tuple[dict[str, torch.Tensor], str]:
+    """Task -> feature of its instruction (text_dim,), zeros if not told; the weights' identity.
+
+    `weights` are those of --clip-weights, `identity` those that must be used; see clip.py.
+    """
+    said = [demonstrations.instruction for demonstrations in recorded.values()]
+    features, identity = text_features(said, weights, identity)
+    return dict(zip(recorded, features.to(device) * told)), identity
+
+
 # ---- Pictures of recordings ----------------------------------------------------------------------
 
 
@@ -281,19 +349,31 @@ def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **
         temporary.unlink(missing_ok=True)
 
 
+def checkpoints_of(path: str | Path) -> list[Path]:
+    """A file as it is; of a run's folder all its EMA checkpoints, the last one last."""
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    if not (found := sorted(path.glob("ema-*.pt")) or sorted(path.glob("adapted.pt"))):
+        inside = ", ".join(str(file.parent) for file in sorted(path.glob("*/adapted.pt")))
+        instead = inside or "a folder of train.py or finetune.py, or a .pt file"
+        raise ValueError(f"{path} holds no checkpoint: name {instead}")
+    return found
+
+
 def load_checkpoint(
     path: str | Path,
     device: str | torch.device = "cpu",
     needs: Sequence[str] = (),
     sampler: str | None = None,
 ) -> tuple[DAMIPolicy, dict[str, Any]]:
-    """Rebuilds the policy of a checkpoint, in evaluation mode on `device`.
+    """Rebuilds the policy of a checkpoint, a folder's last, in evaluation mode on `device`.
 
     Returns (policy, info): info is everything else in the file. `sampler` takes the place of that
     in the configuration. Raises ValueError for a file that is missing, damaged, not one of ours,
     lacks a name in `needs`, or whose weights do not fit.
     """
-    path = Path(path)
+    path = checkpoints_of(path)[-1]
     if not path.is_file():
         raise ValueError(f"no checkpoint at {path}: name a .pt file, or train one with train.py")
     try:
@@ -382,7 +462,7 @@ def restore(
 # ---- Folders of runs -----------------------------------------------------------------------------
 
 RESULTS = "adapted.pt", "adapted-*.pt", "success.json", "success.md", "success.png", "held-out.md"
-OF_ADAPTING = "config.json", "metrics.jsonl"
+OF_ADAPTING = "config.json", "metrics.jsonl", "events.out.tfevents.*"
 
 
 def claim_folder(folder: Path, overwrite: bool) -> None:
@@ -487,20 +567,44 @@ class StopRequest:
         self.requested = before
 
 
-def say_finished(folder: Path, suite: str) -> None:
-    """The last lines of a training: errors on held-out episodes, its files, and what is next."""
-    if (judged := folder / "held-out.md").exists():
-        print(f"\n{judged.read_text().rstrip()}")
-    files = ", ".join(sorted(path.name for path in folder.iterdir()))
-    task = "--data NEW.npz" if suite == "own" else f"--task novel --suite {suite}"
-    print(f"\n{folder} is finished: {files}")
-    print(f"next: python finetune.py {task} --checkpoint {shlex.quote(str(folder))}")
-
-
 def log(folder: Path, **values: Any) -> None:
-    """Appends a line to metrics.jsonl."""
+    """Appends a line to metrics.jsonl, and its numbers to TensorBoard's file if it is installed."""
     with (folder / "metrics.jsonl").open("a") as file:
         file.write(json.dumps(values) + "\n")
+    if (writer := tensorboard(folder)) is not None:
+        for name, value in values.items():
+            if isinstance(value, (int, float)) and name != "step":
+                writer.add_scalar(name, value, values["step"])
+
+
+@functools.cache
+def tensorboard(folder: Path) -> Any:
+    """TensorBoard's writer for a folder; None without that package."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    writer = SummaryWriter(folder, flush_secs=10)
+    atexit.register(writer.close)
+    return writer
+
+
+def begin_run(
+    folder: Path,
+    start: int,
+    settings: Flags,
+    preset: Flags,
+    config: PolicyConfig,
+    facts: dict[str, Any],
+) -> None:
+    """Prints the settings, writes them to a new run's config.json, drops what was logged later."""
+    used = asdict(settings) | asdict(config)
+    usual = asdict(preset) | asdict(PRESETS[config.policy][settings.preset])
+    print_settings(used, usual)
+    if start == 0:
+        written = {"arguments": asdict(settings), "config": asdict(config), **facts}
+        write_text(folder / "config.json", json.dumps(written, indent=1))
+    rewind_metrics(folder, start)
 
 
 def rewind_metrics(folder: Path, step: int) -> None:

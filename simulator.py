@@ -123,12 +123,14 @@ def is_simulated(recorded: Demonstrations, path: str | Path) -> bool:
 
 def own_recordings(folder: str | Path) -> dict[str, Path]:
     """Task -> file of the recordings in a folder; none if they are Meta-World's, by their names."""
-    if not Path(folder).is_dir():
-        raise ValueError(f"there is no folder {folder}: with --suite ml10, experts fill it")
     paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
-    known = [task for task in paths if task in INSTRUCTIONS]
-    if known and len(known) < len(paths):
-        raise ValueError(f"{folder} mixes your recordings with {known[0]}: move one kind elsewhere")
+    known, problem = [task for task in paths if task in INSTRUCTIONS], None
+    if not Path(folder).is_dir():
+        problem = f"there is no folder {folder}: with --suite ml10, experts fill it"
+    elif known and len(known) < len(paths):
+        problem = f"{folder} mixes your recordings with {known[0]}: move one kind elsewhere"
+    if problem:
+        raise ValueError(problem)
     for task in known:
         is_simulated(replace(load_demonstrations(paths[task]), task=task), paths[task])
     return {} if known else paths

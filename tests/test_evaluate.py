@@ -1,8 +1,10 @@
 """Tests of evaluate.py: figures, which checkpoint, rollouts, the policy that ships, bad input."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -46,6 +48,15 @@ def test_a_table_has_a_row_a_task_the_mean_and_the_papers_figures():
     assert rows[4][1] == evaluate.format_success(3, 4)
     paper = [evaluate.paper_success("ml10", task) for task in ("reach", "drawer-close")]
     assert [row[2] for row in rows[2:]] == [f"{value:.1f}" for value in (*paper, sum(paper) / 2)]
+
+
+def test_base_and_novel_tasks_have_means_of_their_own_and_columns_are_aligned():
+    successes = {"reach": [True], "window-open": [True], "door-close": [False]}
+    table = evaluate.success_table({"ours": successes}, "ml10").splitlines()
+    assert len({len(line) for line in table}) == 1
+    means = {line.split("|")[1].strip(): line.split("|")[2].split()[0] for line in table[5:]}
+    assert means == {"**mean of base**": "100.0", "**mean of novel**": "0.0"}
+    assert "**mean** " in evaluate.success_table({"ours": successes})  # of no suite
 
 
 # ---- Which checkpoint ----------------------------------------------------------------------------
@@ -191,7 +202,43 @@ def test_a_rollout_can_be_watched(run, recorded, monkeypatch, capsys):
     evaluate.main(evaluating(run, recorded, "--task reach --gif reach.gif"))
     assert Path("reach.gif").read_bytes().startswith(b"GIF8")
     assert Path("reach.gif").stat().st_size > 10_000
-    assert "wrote reach.gif" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "wrote reach.gif" in printed.out
+    assert "rolling out: 4chunk" in printed.err and "drawing: 100%" in printed.err
+
+
+def test_an_adapted_policy_is_watched_from_its_folder(run, recorded, monkeypatch, capsys):
+    seen = []
+    monkeypatch.setattr(
+        evaluate, "write_gif", lambda policy, sampler, *_: seen.append(sampler.task)
+    )
+    info = torch.load(run / "ema-00006.pt", weights_only=True)
+    Path("all/door-close").mkdir(parents=True)
+    torch.save(info | {"adapted_to": "door-close"}, "all/door-close/adapted.pt")
+    argv = ["--data", str(recorded), *"--demonstrations 2 --gif door.gif --checkpoint".split()]
+    evaluate.main([*argv, "all/door-close"])
+    assert seen == ["door-close"] and "is novel" not in capsys.readouterr().out
+    assert "holds no checkpoint: name all/door-close" in fails(evaluate, [*argv, "all"], capsys)
+    evaluate.main([*argv, str(run), "--task", "door-close"])
+    assert "door-close is novel to this policy: `python finetune.py" in capsys.readouterr().out
+
+
+def test_a_movie_is_written_by_what_is_there(monkeypatch):
+    assert evaluate.movie_writer("x.gif").fps == 8
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ValueError, match="install ffmpeg or `pip install imageio-ffmpeg`"):
+        evaluate.movie_writer("x.mp4")
+    package = SimpleNamespace(get_ffmpeg_exe=lambda: sys.executable)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", package)
+    assert evaluate.movie_writer("x.mp4").bin_path() == sys.executable
+    with pytest.raises(ValueError, match="there is no such folder"):
+        evaluate.movie_writer("none/x.gif")
+
+
+def test_a_folder_stands_for_its_last_checkpoint(run):
+    info = scripts.load_checkpoint(run)[1]
+    assert info["step"] == 6 and len(scripts.checkpoints_of(run)) == 2
 
 
 TABLE = """
@@ -284,7 +331,7 @@ def test_your_own_simulator_is_rolled_out_in(monkeypatch):
         ("--checkpoint none.pt", "none.pt"),
         ("--episodes 0", "--episodes is 0: use at least 1"),
         ("--gif reach.gif", "name its task"),
-        ("--task reach --gif reach.mp4", "reach.gif"),
+        ("--task reach --gif reach.avi", "name it .gif or .mp4"),
         ("--seed -1", "seed"),
         ("--task raech", "did you mean 'reach'?"),
         ("--suite ml-45", "did you mean 'ml45'?"),

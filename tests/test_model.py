@@ -686,7 +686,6 @@ def test_a_policy_that_reads_a_task_does_not_act_without_one():
     "changes, message",
     [
         ({"kernel_size": 4}, r"kernel_size \+ 1 by 2 \(use an odd one\): 5 by 2"),
-        ({"timestep_dim": 33}, "timestep_dim by 2: 33 by 2"),
         ({"horizon": 15}, "horizon by 2 for each level of the U-Net but the last: 15 by 2"),
         ({"horizon": 4}, "n_action_steps 8: horizon 4 has 3 after observation 2"),
     ],
