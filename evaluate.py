@@ -413,13 +413,29 @@ def evaluate(
     return results
 
 
-def evaluate_step(folder: Path, step: int, *arguments: Any) -> Successes:
-    """`evaluate` of a run's checkpoint, logged in metrics.jsonl, unless it was done before."""
+def evaluate_step(
+    folder: Path,
+    step: int,
+    settings: Any,
+    stop: scripts.StopRequest,
+    paths: dict[str, Path],
+    text: dict[str, Tensor],
+    *others: Any,
+) -> Successes | None:
+    """`evaluate` of a run's checkpoint where that is due, logged, unless it was done before.
+
+    `settings` are those of train.py, `others` come after `seed`. Ctrl-C stops it at once.
+    """
+    due = step == settings.steps or (step and step % settings.evaluate_every == 0)
+    if not settings.episodes or not due:
+        return None
     for line in (folder / "metrics.jsonl").read_text().splitlines():
         values = json.loads(line)
         if values["step"] == step and "successes" in values:
             return values["successes"]
-    successes = evaluate(folder / f"ema-{step:05d}.pt", *arguments)
+    protocol = settings.episodes, EVALUATION_SEED, *others
+    with stop.at_once():  # everything is saved
+        successes = evaluate(folder / f"ema-{step:05d}.pt", paths, text, *protocol)
     scripts.log(folder, step=step, success=mean_success(successes), successes=successes)
     return successes
 

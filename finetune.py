@@ -39,7 +39,7 @@ class Settings(Flags):
     """What an adaptation is made of; each field is a flag. None: as the preset has it."""
 
     steps: int = setting(200, "gradient steps (default: 200)", least=1)
-    batch: int | None = setting(None, f"windows a step (default: {BATCH})", least=1)
+    batch: int | None = setting(None, f"windows a step{scripts.of_presets(BATCH)}", least=1)
     lr_vision: float | None = setting(None, "learning rate of the observation encoder", least=0)
     lr_diffusion: float | None = setting(None, "learning rate of the U-Net", least=0)
     lr_other: float | None = setting(None, "learning rate of VMT and U2T", least=0)
@@ -173,7 +173,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--out", help="folder of the adapted policy (default: runs/finetune/TASK-seedSEED)")
     add("--overwrite", action="store_true", help="replace what is in that folder")
     scripts.add_common_flags(add)
-    Settings.add_flags(parser.add_argument_group("settings"))
+    rates = f"Learning rates at a meta-training rate of {PAPER_LEARNING_RATE:g}: {LEARNING_RATES}."
+    Settings.add_flags(parser.add_argument_group("settings", rates))
     return parser.parse_args(argv)
 
 

@@ -79,8 +79,9 @@ class Flags:
                 options = {"action": argparse.BooleanOptionalAction}
             else:
                 options = {"type": kind, "choices": f.metadata.get("choices")}
-            shown = "" if f.name in ("suite", "preset") else of_presets(presets or {}, f.name)
-            help = f.metadata["help"] + shown
+            said = {} if f.name in ("suite", "preset") else presets or {}
+            values = {name: getattr(preset, f.name) for name, preset in said.items()}
+            help = f.metadata["help"] + of_presets(values)
             parser.add_argument(f"--{f.name.replace('_', '-')}", help=help, **options)
 
     def given(self, args: argparse.Namespace, **more: Any) -> Any:
@@ -89,9 +90,8 @@ class Flags:
         return replace(self, **{name: value for name, value in flags.items() if value is not None})
 
 
-def of_presets(presets: dict[str, Any], name: str) -> str:
-    """` (paper 20, small 4, tiny 4)`, or ` (20)` where all have it: an attribute's values."""
-    values = {preset: getattr(settings, name) for preset, settings in presets.items()}
+def of_presets(values: dict[str, Any]) -> str:
+    """` (paper 20, small 4, tiny 4)`, or ` (20)` where all have it: preset -> a setting's value."""
     if len(set(values.values())) > 1:
         return f" ({', '.join(f'{preset} {value}' for preset, value in values.items())})"
     return f" ({next(iter(values.values()))})" if values else ""
@@ -100,12 +100,11 @@ def of_presets(presets: dict[str, Any], name: str) -> str:
 def add_architecture_flags(parser: argparse.ArgumentParser) -> None:
     """Adds the flags of what `choose_config` makes a policy's configuration of."""
     add = parser.add_argument_group("architecture (default: the preset's)").add_argument
-    presets = PRESETS["dami"]
-    for name, choices in CHOICES.items():
-        help = f"see model.PolicyConfig{of_presets(presets, name)}"
-        add(f"--{name.replace('_', '-')}", choices=choices, help=help)
-    points = f"points of each cloud that the policy reads{of_presets(presets, 'num_points')}"
-    add("--num-points", type=int, help=points)
+    flags = {name: {"choices": choices} for name, choices in CHOICES.items()}
+    for name, options in (flags | {"num_points": {"type": int}}).items():
+        values = {preset: getattr(config, name) for preset, config in PRESETS["dami"].items()}
+        what = "points of a cloud" if name == "num_points" else "see model.PolicyConfig"
+        add(f"--{name.replace('_', '-')}", help=what + of_presets(values), **options)
 
 
 def format_table(rows: Sequence[Sequence[Any]]) -> str:
@@ -123,7 +122,13 @@ def print_settings(used: dict[str, Any], default: dict[str, Any]) -> None:
         [name, value, "" if default.get(name, value) == value else default[name]]
         for name, value in used.items()
     ]
-    print(format_table([["setting", "value", "default"], *rows]), flush=True)
+    print_once(format_table([["setting", "value", "default"], *rows]))
+
+
+@functools.cache
+def print_once(text: str) -> None:
+    """Prints what several tasks have in common for the first of them."""
+    print(text, flush=True)
 
 
 # ---- Command lines -------------------------------------------------------------------------------

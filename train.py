@@ -339,18 +339,11 @@ def run(
     if leader:
         scripts.begin_run(folder, start, settings, SETTINGS[settings.preset], config, facts)
 
-    def measure(step: int) -> evaluate.Successes | None:
-        """Evaluates the checkpoint of this step if that is due, and was not done before."""
-        due = step == settings.steps or (step and step % settings.evaluate_every == 0)
-        if not leader or not settings.episodes or not due:
-            return None
-        protocol = (settings.episodes, evaluate.EVALUATION_SEED, args.workers, device)
-        with stop.at_once():  # everything is saved
-            return evaluate.evaluate_step(folder, step, paths, text, *protocol, shown)
-
     bar = {"desc": "training", "unit": "step", "total": settings.steps, "initial": start}
     with scripts.StopRequest() as stop, progress_bar(**bar, disable=not leader) as progress:
-        measure(start)  # the run may have been stopped while it was measured
+        how = settings, stop, paths, text, args.workers, device, shown
+        if leader:
+            evaluate.evaluate_step(folder, start, *how)  # the run may have been stopped meanwhile
         began = saved = time.monotonic()
         training = meta_train(
             policy, ema, optimizer, samplers, text, settings, undone, start, rank, world
@@ -377,11 +370,11 @@ def run(
             if leader and milestone:
                 evaluate.judge(folder, step, ema.module, samplers, unseen, text)
                 evaluate.draw_curves(folder)
-                measure(step)
+                evaluate.evaluate_step(folder, step, *how)
             began = time.monotonic()
 
-        successes = measure(settings.steps)
     if leader:
+        successes = evaluate.evaluate_step(folder, settings.steps, *how)
         evaluate.report_training(folder, settings, config.policy, seconds, facts, successes)
 
 

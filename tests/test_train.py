@@ -54,7 +54,7 @@ def test_help_says_each_presets_value(capsys):
     printed = " ".join(capsys.readouterr().out.split())
     assert "outer steps (paper 54000, small 10000, tiny 30)" in printed
     assert "of weights, batches and noise (0)" in printed
-    assert "policy reads (paper 512, small 128, tiny 64)" in printed
+    assert "points of a cloud (paper 512, small 128, tiny 64)" in printed
 
 
 def test_the_learning_rate_warms_up_and_falls_to_zero_along_a_cosine():
