@@ -91,8 +91,8 @@ class FlowPolicy(DAMIPolicy):
         times = draw(torch.rand, n, like=like, generator=generator)
         return {"noise": noise, "times": self.START + (1 - self.START) * times}
 
-    def shapes(self, B: int, *frames: int) -> dict[str, tuple[int, ...]]:
-        return super().shapes(B, *frames) | {"times": (B,)}
+    def shapes(self) -> dict[str, tuple[int | str, ...]]:
+        return super().shapes() | {"times": ("B",)}
 
     def loss(
         self, points: Tensor, state: Tensor, action: Tensor, noise: Tensor, times: Tensor, **task
@@ -454,10 +454,10 @@ class FreqPolicy(DAMIPolicy):
         mask = rank < (H * share).ceil()[:, None]
         return {"noise": noise, "timesteps": timesteps, "cutoffs": cutoffs, "mask": mask}
 
-    def shapes(self, B: int, *frames: int) -> dict[str, tuple[int, ...]]:
+    def shapes(self) -> dict[str, tuple[int | str, ...]]:
         H = self.config.horizon
-        own = {"timesteps": (B, H), "cutoffs": (B,), "mask": (B, H)}
-        return super().shapes(B, *frames) | own
+        own = {"timesteps": ("B", H), "cutoffs": ("B",), "mask": ("B", H)}
+        return super().shapes() | own
 
     def loss(
         self,

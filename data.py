@@ -1,6 +1,6 @@
 """Demonstrations: their files, the windows that are trained on, and augmentation.
 
-    python data.py --show data/reach.npz        # draws a recording to a PNG
+    python data.py --show data/reach.npz        # draws a recording to a PNG; see convert.py
 
 Nothing here knows a simulator or a robot: simulator.py and robot.py record, and so may you. A file
 is checked when it is read, `WindowSampler` holds it as tensors, and its `batch` draws what
@@ -379,6 +379,7 @@ class WindowSampler:
 
 
 if __name__ == "__main__":
-    from scripts import command_line, show  # not needed where this file is copied to
+    from convert import main  # neither is needed where this file is copied to
+    from scripts import command_line
 
-    command_line(show)
+    command_line(main)

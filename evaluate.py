@@ -2,7 +2,7 @@
 
     python evaluate.py                                       # base tasks, the newest run
     python evaluate.py --checkpoint runs/a runs/b --top 5    # all checkpoints of two runs
-    python evaluate.py --task reach --gif reach.gif          # watch one rollout
+    python evaluate.py --task reach --gif reach.gif          # watch one rollout (.mp4 too)
     python evaluate.py --without instruction --swap demonstration    # is the demonstration read?
 
 An episode succeeds if any of its 200 steps reports success, so a rollout ends there. Each rollout
@@ -19,22 +19,41 @@ N points, A action dim, S state dim.
 import argparse
 import json
 import math
+import shlex
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 import scripts
-from clip import text_features
-from data import WindowSampler, load_demonstrations, write_atomically
+from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
 from model import CHOICES, DAMIPolicy
-from scripts import at_least, command_line, load_checkpoint, run_jobs, worker, write_text
-from simulator import MetaWorldPointCloudEnv, check_task, collect, evaluation_seed, suite_tasks
+from scripts import (
+    at_least,
+    checkpoints_of,
+    command_line,
+    format_table,
+    load_checkpoint,
+    run_jobs,
+    worker,
+    write_text,
+)
+from simulator import (
+    SUITES,
+    MetaWorldPointCloudEnv,
+    check_task,
+    collect,
+    evaluation_seed,
+    suite_tasks,
+)
 
+EVALUATION_SEED = 0  # of the goals; the same for every seed of training
 EPISODES_A_JOB = 10  # side by side in one process; part of the protocol: it shapes the noise drawn
 PAPER_RESULTS = Path(__file__).parent / "assets" / "paper_results.json"
 SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
@@ -84,16 +103,6 @@ def mean_interval(values: Sequence[float]) -> str:
 # ---- What to measure, and on what ----------------------------------------------------------------
 
 
-def checkpoints_of(path: str | Path) -> list[Path]:
-    """A file as it is; of a run's folder all its EMA checkpoints, the last one last."""
-    path = Path(path)
-    if not path.is_dir():
-        return [path]
-    if not (found := sorted(path.glob("ema-*.pt")) or sorted(path.glob("adapted.pt"))):
-        raise ValueError(f"{path} holds no checkpoint: name a folder of train.py, or a .pt file")
-    return found
-
-
 def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
     """The last checkpoint of the newest finished run on `suite`; without any, the one that ships.
 
@@ -118,9 +127,29 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
 # ---- Rollouts ------------------------------------------------------------------------------------
 
 
+class Environment(Protocol):
+    """What `rollout` asks of a simulator: Meta-World's, or your own with these three methods.
+
+    An observation holds "point_cloud" (N, 3) and "agent_pos" (S,), both float32, as the policy was
+    trained on them. simulator.RayCastCamera makes clouds of any MuJoCo model.
+    """
+
+    def reset(self, *, seed: int) -> tuple[dict[str, np.ndarray], dict]:
+        """Begins the episode of a seed; returns (observation, info)."""
+
+    def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
+        """Takes one step with an action (A,); returns (reward, truncated, {"success": bool}).
+
+        After a success, or `truncated`, it is not called again.
+        """
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """The observation of the present moment."""
+
+
 def rollout(
     policy: DAMIPolicy,
-    envs: Sequence[MetaWorldPointCloudEnv],
+    envs: Sequence[Environment],
     seeds: Sequence[int],
     sampler: WindowSampler,
     text: Tensor,
@@ -135,7 +164,7 @@ def rollout(
 
     Args:
         policy: in evaluation mode.
-        envs, seeds: E environments and the seeds of their goals.
+        envs, seeds: E simulators, see `Environment`, and the seeds of their goals.
         sampler: of the task's demonstrations, from which one a rollout is drawn.
         text: instruction feature, (text_dim,).
         generator: draws demonstrations and noise; on the CPU.
@@ -203,6 +232,98 @@ def sample_chunks(
         return torch.cat(each).cpu().numpy()
     context = tuple(torch.cat(parts) for parts in zip(*contexts))
     return policy.sample_actions(points, state, context, generator).cpu().numpy()
+
+
+# ---- Without a simulator: held-out episodes ------------------------------------------------------
+
+
+def hold_out(
+    recorded: dict[str, Demonstrations], n: int
+) -> tuple[dict[str, Demonstrations], dict[str, Demonstrations]]:
+    """Parts each recording, by task, into all but its last n episodes, and those; n = 0: no others.
+
+    Raises ValueError where nothing would be left to train on.
+    """
+    kept, held = {}, {}
+    for task, whole in recorded.items():
+        if n and n >= len(whole):
+            raise ValueError(f"{task} has {len(whole)} episodes: use a --held-out below that")
+        kept[task] = whole.take(len(whole) - n)
+        if n:
+            start, meta = len(kept[task].points), dict(whole.meta)
+            if "success_frames" in meta:
+                meta["success_frames"] = meta["success_frames"][len(kept[task]) : len(whole)]
+            parts = {part: getattr(whole, part)[start:] for part in ("points", "state", "action")}
+            ends = whole.episode_ends[-n:] - start
+            held[task] = replace(whole, **parts, episode_ends=ends, meta=meta)
+    return kept, held
+
+
+@torch.no_grad()
+def action_error(
+    policy: DAMIPolicy, shown: WindowSampler, unseen: WindowSampler, text: Tensor, seed: int = 0
+) -> tuple[float, float]:
+    """How far drawn actions are from an expert's: mean absolute error, in the action's unit.
+
+    Episodes are gone through as in a rollout, from one executed chunk of Ta actions to the next,
+    but the policy sees the expert's frames: so errors do not add up. The mean is over episodes'
+    chunks, their Ta steps and the A numbers of an action.
+
+    Args:
+        policy: in any mode.
+        shown: the episodes trained on; one of them is the reference demonstration.
+        unseen: the episodes to judge by.
+        text: instruction feature, (text_dim,).
+        seed: of references and noise.
+
+    Returns:
+        The error, and that of always doing the mean action of `shown`, to compare it with.
+    """
+    generator, errors, plain = torch.Generator().manual_seed(seed), [], []
+    newest, Ta = policy.config.n_obs_steps - 1, policy.config.n_action_steps
+    for episode in range(len(unseen.episodes)):
+        demo = shown.demonstration(shown.draw_episode(generator))
+        context = policy.encode_demo(text[None], **demo)
+        windows = unseen.gather((unseen.episode_of == episode).nonzero()[::Ta, 0])
+        done = windows["action"][:, newest : newest + Ta]  # (n, Ta, A)
+        seen = windows["points"], windows["state"]
+        drawn = policy.sample_actions(*seen, context, generator)  # (n, Ta, A)
+        errors.append((drawn - done).abs().flatten())
+        plain.append((shown.action.mean(dim=0) - done).abs().flatten())
+    return torch.cat(errors).mean().item(), torch.cat(plain).mean().item()
+
+
+def judge(
+    folder: Path,
+    step: int,
+    policy: DAMIPolicy,
+    shown: dict[str, WindowSampler],
+    unseen: dict[str, WindowSampler],
+    text: dict[str, Tensor],
+) -> str:
+    """Logs the action errors on held-out episodes, of which there may be none.
+
+    Returns a table, also in held-out.md: a row a task, the errors at the first and last step that
+    was judged so far, and those of always doing the mean action.
+    """
+    if not unseen:
+        return ""
+    found = {task: action_error(policy, shown[task], unseen[task], text[task]) for task in unseen}
+    errors = {task: error for task, (error, _) in found.items()}
+    mean = float(np.mean(list(errors.values())))
+    scripts.log(folder, step=step, action_error=mean, action_errors=errors)
+
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    columns = {line["step"]: line["action_errors"] for line in lines if "action_errors" in line}
+    columns = {f"step {k}": columns[k] for k in sorted({min(columns), step})}
+    columns["the mean action"] = {task: error for task, (_, error) in found.items()}
+    rows = [[task, *(f"{errors[task]:.4f}" for errors in columns.values())] for task in found]
+    if len(rows) > 1:
+        means = [f"{np.mean(list(errors.values())):.4f}" for errors in columns.values()]
+        rows.append(["**mean**", *means])
+    table = format_table([["held-out action error", *columns], *rows])
+    write_text(folder / "held-out.md", f"{table}\n\nMean absolute error, in the action's unit.\n")
+    return table
 
 
 # ---- Evaluation in worker processes --------------------------------------------------------------
@@ -292,13 +413,29 @@ def evaluate(
     return results
 
 
-def evaluate_step(folder: Path, step: int, *arguments: Any) -> Successes:
-    """`evaluate` of a run's checkpoint, logged in metrics.jsonl, unless it was done before."""
+def evaluate_step(
+    folder: Path,
+    step: int,
+    settings: Any,
+    stop: scripts.StopRequest,
+    paths: dict[str, Path],
+    text: dict[str, Tensor],
+    *others: Any,
+) -> Successes | None:
+    """`evaluate` of a run's checkpoint where that is due, logged, unless it was done before.
+
+    `settings` are those of train.py, `others` come after `seed`. Ctrl-C stops it at once.
+    """
+    due = step == settings.steps or (step and step % settings.evaluate_every == 0)
+    if not settings.episodes or not due:
+        return None
     for line in (folder / "metrics.jsonl").read_text().splitlines():
         values = json.loads(line)
         if values["step"] == step and "successes" in values:
             return values["successes"]
-    successes = evaluate(folder / f"ema-{step:05d}.pt", *arguments)
+    protocol = settings.episodes, EVALUATION_SEED, *others
+    with stop.at_once():  # everything is saved
+        successes = evaluate(folder / f"ema-{step:05d}.pt", paths, text, *protocol)
     scripts.log(folder, step=step, success=mean_success(successes), successes=successes)
     return successes
 
@@ -315,21 +452,27 @@ def paper_success(suite: str | None, task: str) -> float | None:
     return None
 
 
+def parts_of(tasks: Sequence[str], suite: str | None) -> dict[str, list[str]]:
+    """What to call the mean, and of which tasks; base and novel ones of a suite are told apart."""
+    split = zip(("base", "novel"), suite_tasks(suite) if suite in SUITES else ((), ()))
+    parts = {f"mean of {part}": [t for t in tasks if t in known] for part, known in split}
+    whole = all(parts.values()) and sum(map(len, parts.values())) == len(tasks)
+    return parts if whole else {"mean": list(tasks)}
+
+
 def success_table(columns: dict[str, Successes], suite: str | None = None) -> str:
-    """A Markdown table: a row a task, a column for each set of results, the paper's; the mean."""
+    """A Markdown table: a row a task, a column for each set of results, the paper's; the means."""
+
+    def row(name: str, tasks: Sequence[str]) -> list[str]:
+        cells = [pooled_success({t: results[t] for t in tasks}) for results in columns.values()]
+        known = [paper_success(suite, task) for task in tasks]
+        return [name, *cells, "" if None in known else f"{np.mean(known):.1f}"]
+
     tasks = list(next(iter(columns.values())))
-    paper = {task: paper_success(suite, task) for task in tasks}
-    lines = [f"| task | {' | '.join(columns)} | paper |", "|---" * (len(columns) + 2) + "|"]
-    for task in tasks:
-        cells = [pooled_success({task: results[task]}) for results in columns.values()]
-        known = "" if paper[task] is None else f"{paper[task]:.1f}"
-        lines.append(f"| {task} | {' | '.join(cells)} | {known} |")
+    rows = [["task", *columns, "paper"], *(row(task, [task]) for task in tasks)]
     if len(tasks) > 1:
-        cells = [pooled_success(results) for results in columns.values()]
-        known = [value for value in paper.values() if value is not None]
-        mean = f"{np.mean(known):.1f}" if len(known) == len(tasks) else ""
-        lines.append(f"| **mean** | {' | '.join(cells)} | {mean} |")
-    return "\n".join(lines)
+        rows += [row(f"**{name}**", part) for name, part in parts_of(tasks, suite).items()]
+    return format_table(rows)
 
 
 def draw_success(
@@ -387,6 +530,31 @@ def write_report(
     return table
 
 
+def report_training(
+    folder: Path,
+    arguments: Any,
+    policy: str,
+    seconds: float,
+    facts: dict[str, Any],
+    successes: Successes | None,
+) -> None:
+    """What stands at the end of a training: curves, success or held-out errors, what is next."""
+    draw_curves(folder)
+    if successes:
+        facts = facts | {"title": f"{arguments.suite}, base tasks, {arguments.preset}, {policy}"}
+        facts |= {"episodes a task": arguments.episodes, "seed": EVALUATION_SEED}
+        facts |= {"training": f"{seconds / 60:.1f} min", "training seed": arguments.seed}
+        columns = {"last checkpoint": successes}
+        print(f"\n{write_report(folder, columns, facts, arguments.suite)}")
+    if (judged := folder / "held-out.md").exists():
+        print(f"\n{judged.read_text().rstrip()}")
+    files = ", ".join(sorted(path.name for path in folder.iterdir()))
+    suite = arguments.suite
+    new = "--data NEW.npz" if suite == "own" else f"--task novel --suite {suite}"
+    print(f"\n{folder} is finished: {files}")
+    print(f"next: python finetune.py {new} --checkpoint {shlex.quote(str(folder))}")
+
+
 def draw_curves(folder: Path) -> None:
     """Draws curves.png of a run: the query loss, its running mean, and success where measured."""
     from matplotlib.figure import Figure
@@ -394,7 +562,9 @@ def draw_curves(folder: Path) -> None:
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     steps = np.array([line["step"] for line in lines if "loss" in line])
     losses = np.array([line["loss"] for line in lines if "loss" in line])
-    evaluated = [(line["step"], line["success"]) for line in lines if "success" in line]
+    of = {"success": "mean success on base tasks, %", "action_error": "held-out action error"}
+    measured = {name: [(line["step"], line[name]) for line in lines if name in line] for name in of}
+    name = "success" if measured["success"] else "action_error"
 
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots()
@@ -405,12 +575,12 @@ def draw_curves(folder: Path) -> None:
     axes.set(xlabel="outer step", ylabel="loss (actions in [-1, 1])", yscale="log")
     axes.spines["top"].set_visible(False)
     handles, labels = axes.get_legend_handles_labels()
-    if evaluated:
+    if measured[name]:
         right = axes.twinx()
-        (line,) = right.plot(*zip(*evaluated), "o-", color="C1")
-        right.set(ylabel="mean success on base tasks, %", ylim=(0, 100))
+        (line,) = right.plot(*zip(*measured[name]), "o-", color="C1")
+        right.set(ylabel=of[name], ylim=(0, 100 if name == "success" else None))
         right.spines["top"].set_visible(False)
-        handles, labels = [*handles, line], [*labels, "success (right)"]
+        handles, labels = [*handles, line], [*labels, f"{name.replace('_', ' ')} (right)"]
     axes.legend(handles, labels, frameon=False)
 
     path = folder / "curves.png"
@@ -427,19 +597,22 @@ def write_gif(
 
     Returns whether the episode succeeded.
     """
-    from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.animation import FuncAnimation
     from matplotlib.figure import Figure
 
+    writer = movie_writer(path)
     env = MetaWorldPointCloudEnv(sampler.task, policy.config.num_points, render_mode="rgb_array")
     frames = []
 
     def on_chunk(_: int, observation: dict) -> None:
         frames.append((env.render(), observation["point_cloud"]))
+        progress.update()
 
     goal = evaluation_seed(seed, 0)
     generator = torch.Generator().manual_seed(goal)
-    (success,) = rollout(policy, [env], [goal], sampler, text, generator, on_chunk)
-    on_chunk(0, env.observe())  # how it ended
+    with scripts.progress_bar(desc="rolling out", unit="chunk") as progress:
+        (success,) = rollout(policy, [env], [goal], sampler, text, generator, on_chunk)
+        on_chunk(0, env.observe())  # how it ended
 
     clouds = np.concatenate([cloud for _, cloud in frames])
     low, high = clouds.min(0), clouds.max(0)
@@ -464,8 +637,33 @@ def write_gif(
 
     shown = [*range(len(frames)), len(frames) - 1, len(frames) - 1]  # the end stays a while
     animation = FuncAnimation(figure, draw, frames=shown)
-    write_atomically(path, lambda name: animation.save(name, writer=PillowWriter(fps=8), dpi=70))
+    with scripts.progress_bar(desc="drawing", unit="frame", total=len(shown)) as progress:
+        how = {"writer": writer, "dpi": 70, "progress_callback": lambda *_: progress.update()}
+        write_atomically(path, lambda name: animation.save(name, **how))
     return success
+
+
+def movie_writer(path: str | Path) -> Any:
+    """What writes a .gif, or an .mp4 where there is ffmpeg, or the package imageio-ffmpeg with it.
+
+    Raises ValueError for any other file, one of no folder, or where there is neither.
+    """
+    import matplotlib
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    path, problem = Path(path), "name it .gif or .mp4"
+    if not path.resolve().parent.is_dir():
+        problem = "there is no such folder"
+    elif path.suffix == ".gif":
+        return PillowWriter(fps=8)
+    elif path.suffix == ".mp4":
+        with suppress(ImportError):
+            ffmpeg = import_module("imageio_ffmpeg").get_ffmpeg_exe()
+            matplotlib.rcParams["animation.ffmpeg_path"] = ffmpeg
+        if FFMpegWriter.isAvailable():
+            return FFMpegWriter(fps=8)
+        problem = "install ffmpeg or `pip install imageio-ffmpeg`, or name it .gif"
+    raise ValueError(f"cannot write {path}: {problem}")
 
 
 # ---- Command line --------------------------------------------------------------------------------
@@ -492,7 +690,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
     scripts.add_common_flags(add)
-    add("--gif", metavar="FILE", help="write one rollout of --task as an animation instead")
+    add("--gif", metavar="FILE", help="animate one rollout instead, .gif or .mp4")
     return parser.parse_args(argv)
 
 
@@ -520,10 +718,8 @@ def main(argv: list[str] | None = None) -> None:
     at_least(1, demonstrations=args.demonstrations, episodes=args.episodes)
     at_least(0, top=args.top)
     evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after collecting
-    if args.gif and not (args.task and len(args.task) == 1 and args.gif.endswith(".gif")):
-        raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
-    if args.gif and not Path(args.gif).resolve().parent.is_dir():
-        raise ValueError(f"there is no folder to write {args.gif} into")
+    if args.gif:
+        movie_writer(args.gif)  # refuses a wrong name now
     device = scripts.pick_device(args.device)
 
     # Which checkpoints: of each run the last, or all of them for the mean of the best
@@ -543,6 +739,11 @@ def main(argv: list[str] | None = None) -> None:
     # Tasks, their demonstrations and instructions
     suite = args.suite or info["suite"]
     tasks = choose_tasks(args, suite, info)
+    if args.gif and len(tasks) > 1:
+        raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
+    if args.gif and "adapted_to" not in info and tasks[0] in suite_tasks(suite)[1]:
+        adapt = f"python finetune.py --task {tasks[0]}"
+        print(f"{tasks[0]} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
     if args.swap and (len(tasks) < 2 or args.top):
         raise ValueError("--swap needs the tasks of a split, and the last checkpoint alone")
     for checkpoint in labels:
@@ -556,13 +757,12 @@ def main(argv: list[str] | None = None) -> None:
         if not args.gif:
             scripts.claim_folder(out, args.overwrite)
         paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
-        recorded = [load_demonstrations(path).take(args.demonstrations) for path in paths.values()]
-        said = [demonstrations.instruction for demonstrations in recorded]
-        features, identity = text_features(said, args.clip_weights, info["text_weights"])
-        text = dict(zip(tasks, features.to(device)))  # each (text_dim,)
+        n, how = args.demonstrations, (args.clip_weights, info["text_weights"], device)
+        recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
+        text, identity = scripts.instruction_features(recorded, *how)
 
         if args.gif:
-            sampler = WindowSampler(recorded[0], policy.config, device)
+            sampler = WindowSampler(recorded[tasks[0]], policy.config, device)
             success = write_gif(policy, sampler, text[tasks[0]], args.seed, args.gif)
             print(f"{tasks[0]}: {'success' if success else 'failure'}; wrote {args.gif}")
             return
@@ -602,11 +802,13 @@ def measure(
             label = f"{labels[checkpoint]}, {part} of another task"
             swapped[label] = evaluate(checkpoint, *inputs.values(), *protocol)
 
-    means = [[mean_success(results[checkpoint]) for checkpoint in run] for run in runs]
-    facts["mean, last checkpoint"] = mean_interval([run[-1] for run in means])
-    if args.top:
-        best = [float(np.mean(sorted(run)[-args.top :])) for run in means]
-        facts[f"mean, best {args.top} checkpoints"] = mean_interval(best)
+    for name, part in parts_of(list(paths), suite).items():
+        of_part = {path: {task: found[task] for task in part} for path, found in results.items()}
+        means = [[mean_success(of_part[path]) for path in run] for run in runs]
+        facts[f"{name}, last checkpoint"] = mean_interval([run[-1] for run in means])
+        if args.top:
+            best = [float(np.mean(sorted(run)[-args.top :])) for run in means]
+            facts[f"{name}, best {args.top} checkpoints"] = mean_interval(best)
     columns = {labels[run[-1]]: results[run[-1]] for run in runs} | swapped
     all_checkpoints = {labels[path]: found for path, found in results.items()} if args.top else None
     print(f"\n{write_report(Path(args.out), columns, facts, suite, all_checkpoints)}\n")

@@ -24,11 +24,10 @@ from torch import Tensor
 
 import evaluate
 import scripts
-from clip import text_features
 from data import WindowSampler, load_demonstrations
 from model import DAMIPolicy, ema_model
 from scripts import Flags, command_line, load_checkpoint, progress_bar, save_checkpoint, setting
-from simulator import INSTRUCTIONS, check_task, collect, suite_tasks
+from simulator import check_task, collect, is_simulated, suite_tasks
 
 LEARNING_RATES = {"vision": 1e-5, "diffusion": 3e-5, "other": 1e-4}  # AdamW's, by part
 PAPER_LEARNING_RATE = 1e-4  # of the meta-training that they belong to
@@ -40,13 +39,14 @@ class Settings(Flags):
     """What an adaptation is made of; each field is a flag. None: as the preset has it."""
 
     steps: int = setting(200, "gradient steps (default: 200)", least=1)
-    batch: int | None = setting(None, "windows a step (default: the preset's)", least=1)
+    batch: int | None = setting(None, f"windows a step{scripts.of_presets(BATCH)}", least=1)
     lr_vision: float | None = setting(None, "learning rate of the observation encoder", least=0)
     lr_diffusion: float | None = setting(None, "learning rate of the U-Net", least=0)
     lr_other: float | None = setting(None, "learning rate of VMT and U2T", least=0)
     instruction: bool = setting(True, "--no-instruction: adapt and roll out without it")
     normalizer: str = setting("fit", "to the task, or `keep` the suite's", choices=("fit", "keep"))
     demonstrations: int | None = setting(None, "how many (default: 10; of a file all)", least=1)
+    held_out: int = setting(0, "of them, the last so many only judge (default: 0)", least=0)
     episodes: int = setting(20, "rollouts before and after (default: 20)", least=0)
     seed: int = setting(0, "of batches, noise and goals (default: 0)", least=0, most=999)
 
@@ -118,8 +118,13 @@ def adapt_checkpoint(
     """
     policy, info = load_checkpoint(checkpoint, text.device, needs=evaluate.TRAINED)
     demonstrations = load_demonstrations(data).take(settings.demonstrations)
-    trained, device = info["arguments"], text.device
-    sampler = WindowSampler(demonstrations, policy.config, device, trained.get("after_success"))
+    trained, device, task = info["arguments"], text.device, demonstrations.task
+    how = policy.config, device, trained.get("after_success")
+    parts = evaluate.hold_out({task: demonstrations}, settings.held_out)
+    shown, unseen = (scripts.windows(part, *how) for part in parts)
+    sampler, judged_by = shown[task], (shown, unseen, {task: text})
+    scripts.rewind_metrics(folder, 0)
+    evaluate.judge(folder, 0, policy, *judged_by)
     if settings.normalizer == "fit":
         policy.normalizer.fit(sampler.points, sampler.state, sampler.action)  # line 3
 
@@ -129,12 +134,12 @@ def adapt_checkpoint(
     rates = {p: lr * scale if given[p] is None else given[p] for p, lr in LEARNING_RATES.items()}
     batch = settings.batch or BATCH[info["preset"]]
     used = asdict(settings) | {"batch": batch, "learning_rates": rates}
+    scripts.print_settings(used, asdict(Settings()))
     about = {name: info[name] for name in evaluate.TRAINED} | {"adaptation": used}
-    about |= {"adapted_to": demonstrations.task, "instruction": demonstrations.instruction}
+    about |= {"adapted_to": task, "instruction": demonstrations.instruction}
 
-    scripts.rewind_metrics(folder, 0)
     seconds, began = 0.0, time.monotonic()
-    bar = {"desc": f"adapting to {demonstrations.task}", "unit": "step"}
+    bar = {"desc": f"adapting to {task}", "unit": "step"}
     training = adapt_policy(policy, sampler, text, settings.steps, batch, rates, settings.seed)
     with progress_bar(total=settings.steps, **bar) as progress:
         for step, loss, adapted in training:
@@ -147,6 +152,8 @@ def adapt_checkpoint(
             began = time.monotonic()
 
     save_checkpoint(folder / "adapted.pt", adapted, **about)
+    table = evaluate.judge(folder, settings.steps, adapted, *judged_by)
+    print(table, end="\n" if table else "", flush=True)
     written = {"checkpoint": str(checkpoint), "data": str(data), **used, "seconds": seconds}
     scripts.write_text(folder / "config.json", json.dumps(written, indent=1))
     return written
@@ -166,7 +173,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--out", help="folder of the adapted policy (default: runs/finetune/TASK-seedSEED)")
     add("--overwrite", action="store_true", help="replace what is in that folder")
     scripts.add_common_flags(add)
-    Settings.add_flags(parser.add_argument_group("settings"))
+    rates = f"Learning rates at a meta-training rate of {PAPER_LEARNING_RATE:g}: {LEARNING_RATES}."
+    Settings.add_flags(parser.add_argument_group("settings", rates))
     return parser.parse_args(argv)
 
 
@@ -179,17 +187,18 @@ def main(argv: list[str] | None = None) -> None:
     file = Path(args.data) if args.data.endswith(".npz") else None
     if args.task is None and file is None:
         raise ValueError("name a task of Meta-World with --task, or a recording with --data")
+    simulated = True
     if file is not None:
-        tasks = [load_demonstrations(file).task]
+        recorded = load_demonstrations(file)
+        tasks, simulated = [recorded.task], is_simulated(recorded, file)
         if args.task not in (None, tasks):
             raise ValueError(f"{file} is a recording of {tasks[0]}, not of {args.task[0]}")
     elif args.task == ["novel"]:
         tasks = suite_tasks(args.suite)[1]
     else:
         tasks = [check_task(task) for task in args.task]
-    simulated = all(task in INSTRUCTIONS for task in tasks)
     start = args.checkpoint or evaluate.default_checkpoint(args.suite if simulated else "own")
-    checkpoint = evaluate.checkpoints_of(start)[-1]
+    checkpoint = scripts.checkpoints_of(start)[-1]
     _, info = load_checkpoint(checkpoint, needs=evaluate.TRAINED)
     where = f"{device} ({scripts.hardware(device)})"
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {where}", flush=True)
@@ -207,9 +216,9 @@ def main(argv: list[str] | None = None) -> None:
         paths = {tasks[0]: file}
         if file is None:
             paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
-        said = [load_demonstrations(paths[task]).instruction for task in tasks]
-        features, identity = text_features(said, args.clip_weights, info["text_weights"])
-        text = dict(zip(tasks, features.to(device) * settings.instruction))  # each (text_dim,)
+        recorded = {task: load_demonstrations(paths[task]) for task in tasks}
+        how = args.clip_weights, info["text_weights"], device
+        text, identity = scripts.instruction_features(recorded, *how, told=settings.instruction)
 
         # Each task before, in between if asked for, and after
         between = sorted({step for step in args.curve if 0 < step < settings.steps})

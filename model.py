@@ -14,10 +14,10 @@ The file reads from small blocks to `DAMIPolicy` and imports nothing of the proj
 section, PyTorch's layers written out for speed, can be skipped.
 
 Letters: B windows, G windows that share one demonstration, D demonstrations (B = D * G), T frames
-of a demonstration, N points (W winning ones), To = 2 observation steps, H = 16 horizon, Ta = 8
-executed actions, A action dim, S state dim, K = 100 diffusion steps, C condition width
-(timestep_dim + To * observation feature), L length of the action sequence inside the U-Net (H, then
-half of it a level). Clouds and poses are in metres; all that networks see is in [-1, 1].
+of a demonstration, N points (W winning ones), To = 2 observations (the older first), H = 16
+horizon, Ta = 8 executed actions, A action dim, S state dim, K = 100 diffusion steps, C condition
+width (timestep_dim + To * observation feature), L length of the action sequence inside the U-Net
+(H, then half of it a level). Clouds and poses are in metres; networks see [-1, 1].
 """
 
 import math
@@ -95,6 +95,7 @@ class PolicyConfig:
         for whole, part, what in [
             (self.horizon, shrink, "horizon by 2 for each level of the U-Net but the last"),
             (self.diffusion_steps, self.inference_steps, "diffusion_steps by inference_steps"),
+            (self.kernel_size + 1, 2, "kernel_size + 1 by 2 (use an odd one)"),
             (self.demo_dim, self.vmt_heads, "demo_dim by vmt_heads"),
             (self.condition_dim, self.u2t_heads, "condition width by u2t_heads"),
             (math.gcd(*self.unet_widths), self.n_groups, "U-Net widths by n_groups"),
@@ -539,13 +540,15 @@ class DAMIPolicy(nn.Module):
             return None
         tokens = None
         if config.demo_encoder != "none":
-            parts = {"demo_state": demo_state, "demo_action": demo_action}
-            self.check_shapes(demo_points=demo_points, **parts)
+            shown = {"demo_points": demo_points, "demo_state": demo_state}
+            self.check_shapes(**shown, demo_action=demo_action, text=text)
             if (T := demo_points.shape[1]) > (most := config.demo_positions):
                 raise ValueError(f"a demonstration has {T} frames, the policy {most} positions")
             features = self.encode_observations(demo_points, demo_state)  # (D, T, feature)
             actions = self.normalizer.normalize("action", demo_action)  # (D, T, A)
             tokens = self.demo_encoder(features, actions)  # (D, T, demo_dim)
+        else:
+            self.check_shapes(text=text)
         return self.u2t.encode_context(tokens, text)
 
     def denoise(
@@ -597,6 +600,8 @@ class DAMIPolicy(nn.Module):
         from the newest observation on, in the demonstrations' unit.
         """
         self.check_shapes(points=points, state=state)
+        if context is None and self.config.reads_task:
+            raise ValueError("context is missing: it is what `encode_demo` makes of a task")
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
         shape = (len(points), self.config.horizon, self.config.action_dim)
         source = points.device if generator is None else generator.device
@@ -614,20 +619,27 @@ class DAMIPolicy(nn.Module):
         chunk = actions[:, newest : newest + self.config.n_action_steps]  # (B, Ta, A)
         return self.normalizer.unnormalize("action", chunk)
 
-    def check_shapes(self, **inputs: Tensor) -> None:
-        """Raises ValueError for shapes that would broadcast to a wrong result without an error."""
-        expected = self.shapes(*next(iter(inputs.values())).shape[:-1])  # of the clouds
+    def check_shapes(self, **inputs: Tensor | None) -> None:
+        """Raises ValueError for what is missing, or would broadcast to a wrong result silently."""
+        sizes = {}  # what each letter stands for; a number for itself
         for name, x in inputs.items():
-            if x.shape != expected[name]:
-                raise ValueError(f"{name} is {tuple(x.shape)}, the policy takes {expected[name]}")
+            expected, found = self.shapes()[name], () if x is None else tuple(x.shape)
+            if len(found) == len(expected):
+                for n, size in zip(expected, found):
+                    sizes.setdefault(n, size if isinstance(n, str) else n)
+                expected = tuple(sizes[n] for n in expected)
+            if found != expected:
+                found, takes = "missing" if x is None else found, str(expected).replace("'", "")
+                raise ValueError(f"{name} is {found}, the policy takes {takes}")
 
-    def shapes(self, B: int, T: int, *N: int) -> dict[str, tuple[int, ...]]:
-        """What each input's shape must be, for B clouds of T frames and any number of points."""
+    def shapes(self) -> dict[str, tuple[int | str, ...]]:
+        """What each input's shape must be, where a letter stands for any size, but one for all."""
         To, S, A = self.config.n_obs_steps, self.config.state_dim, self.config.action_dim
-        seen = {"points": (B, To, *N, 3), "state": (B, To, S)}
-        shown = {"demo_points": (B, T, *N, 3), "demo_state": (B, T, S), "demo_action": (B, T, A)}
-        chunk = (B, self.config.horizon, A)
-        return {**seen, **shown, "action": chunk, "noise": chunk, "timesteps": (B,)}
+        seen = {"points": ("B", To, "N", 3), "state": ("B", To, S), "timesteps": ("B",)}
+        shown = {"demo_points": ("D", "T", "N", 3), "demo_state": ("D", "T", S)}
+        shown |= {"demo_action": ("D", "T", A), "text": ("D", self.config.text_dim)}
+        chunk = ("B", self.config.horizon, A)
+        return {**seen, **shown, "action": chunk, "noise": chunk}
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
         """Draws what makes `loss` pure: noise (n, H, A) and timesteps (n,) int64."""

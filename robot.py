@@ -33,10 +33,8 @@ import select
 import socket
 import struct
 import sys
-import termios
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import MISSING, dataclass, fields
@@ -1050,12 +1048,17 @@ class Keys:
     """The keys pressed so far, one at a time, without waiting: of a terminal, or of stdin."""
 
     def __enter__(self) -> Keys:
+        import termios  # Windows has neither: scripts.py says so
+        import tty
+
         self.old = termios.tcgetattr(sys.stdin) if sys.stdin.isatty() else None
         if self.old is not None:
             tty.setcbreak(sys.stdin)  # no Enter is needed
         return self
 
     def __exit__(self, *_: Any) -> None:
+        import termios
+
         if self.old is not None:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self.old)
 

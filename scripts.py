@@ -5,8 +5,9 @@ step at hand, work is shared among processes. Skip this file when reading the me
 """
 
 import argparse
+import atexit
 import difflib
-import fcntl
+import functools
 import hashlib
 import json
 import math
@@ -39,8 +40,15 @@ from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
 from baselines import PRESETS, build_policy
-from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
+from clip import text_features
+from data import Demonstrations, WindowSampler, write_atomically
 from model import CHOICES, DAMIPolicy, PolicyConfig
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    print("error: this needs Linux or macOS; on Windows, run it under WSL", file=sys.stderr)
+    sys.exit(2)
 
 # ---- Settings: each said once, as a field --------------------------------------------------------
 
@@ -63,20 +71,64 @@ class Flags:
                 raise ValueError(f"--{f.name.replace('_', '-')} is {value}: use {limit}")
 
     @classmethod
-    def add_flags(cls, parser: Any) -> None:
-        """Adds a flag for each field; one that is not given is None."""
+    def add_flags(cls, parser: Any, presets: dict[str, "Flags"] | None = None) -> None:
+        """Adds a flag for each field, which tells each preset's value; None if it is not given."""
         for f in fields(cls):
             kind = next((t for t in get_args(f.type) if t is not type(None)), f.type)
             if kind is bool:
                 options = {"action": argparse.BooleanOptionalAction}
             else:
                 options = {"type": kind, "choices": f.metadata.get("choices")}
-            parser.add_argument(f"--{f.name.replace('_', '-')}", help=f.metadata["help"], **options)
+            said = {} if f.name in ("suite", "preset") else presets or {}
+            values = {name: getattr(preset, f.name) for name, preset in said.items()}
+            help = f.metadata["help"] + of_presets(values)
+            parser.add_argument(f"--{f.name.replace('_', '-')}", help=help, **options)
 
     def given(self, args: argparse.Namespace, **more: Any) -> Any:
         """Returns these settings with what was given on the command line, and `more`."""
         flags = {f.name: getattr(args, f.name) for f in fields(self)} | more
         return replace(self, **{name: value for name, value in flags.items() if value is not None})
+
+
+def of_presets(values: dict[str, Any]) -> str:
+    """` (paper 20, small 4, tiny 4)`, or ` (20)` where all have it: preset -> a setting's value."""
+    if len(set(values.values())) > 1:
+        return f" ({', '.join(f'{preset} {value}' for preset, value in values.items())})"
+    return f" ({next(iter(values.values()))})" if values else ""
+
+
+def add_architecture_flags(parser: argparse.ArgumentParser) -> None:
+    """Adds the flags of what `choose_config` makes a policy's configuration of."""
+    add = parser.add_argument_group("architecture (default: the preset's)").add_argument
+    flags = {name: {"choices": choices} for name, choices in CHOICES.items()}
+    for name, options in (flags | {"num_points": {"type": int}}).items():
+        values = {preset: getattr(config, name) for preset, config in PRESETS["dami"].items()}
+        what = "points of a cloud" if name == "num_points" else "see model.PolicyConfig"
+        add(f"--{name.replace('_', '-')}", help=what + of_presets(values), **options)
+
+
+def format_table(rows: Sequence[Sequence[Any]]) -> str:
+    """A Markdown table, the first row its head, whose columns are aligned in a terminal too."""
+    rows = [[str(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    rows.insert(1, ["-" * width for width in widths])
+    filled = [[cell.ljust(width) for cell, width in zip(row, widths)] for row in rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in filled)
+
+
+def print_settings(used: dict[str, Any], default: dict[str, Any]) -> None:
+    """A table of what a run is made of, and of what that would be by default."""
+    rows = [
+        [name, value, "" if default.get(name, value) == value else default[name]]
+        for name, value in used.items()
+    ]
+    print_once(format_table([["setting", "value", "default"], *rows]))
+
+
+@functools.cache
+def print_once(text: str) -> None:
+    """Prints what several tasks have in common for the first of them."""
+    print(text, flush=True)
 
 
 # ---- Command lines -------------------------------------------------------------------------------
@@ -175,17 +227,6 @@ def report_facts(
 OWN_FRAMES = 500  # the paper's positions on the real robot
 
 
-def own_recordings(folder: str | Path, others: Iterable[str]) -> dict[str, Path]:
-    """Task -> file of the recordings in a folder, if none is of a task among `others`; else {}."""
-    if not Path(folder).is_dir():
-        raise ValueError(f"there is no folder {folder}: with --suite ml10, experts fill it")
-    paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
-    known = sorted(set(paths) & set(others))
-    if known and len(known) < len(paths):
-        raise ValueError(f"{folder} mixes your recordings with {known[0]}: move one kind elsewhere")
-    return {} if known else paths
-
-
 def choose_config(
     args: argparse.Namespace, preset: str, recorded: dict[str, Demonstrations], own: bool
 ) -> PolicyConfig:
@@ -206,6 +247,27 @@ def choose_config(
             demo_positions=math.ceil(longest / config.demo_stride),
         )
     return config
+
+
+def windows(recorded: dict[str, Demonstrations | None], *how: Any) -> dict[str, WindowSampler]:
+    """The windows of each task that there is a recording of; `how` as WindowSampler takes it."""
+    return {task: WindowSampler(d, *how) for task, d in recorded.items() if d is not None}
+
+
+def instruction_features(
+    recorded: dict[str, Demonstrations],
+    weights: str | None,
+    identity: str | None,
+    device: str | torch.device,
+    told: bool = True,
+) -> tuple[dict[str, torch.Tensor], str]:
+    """Task -> feature of its instruction (text_dim,), zeros if not told; the weights' identity.
+
+    `weights` are those of --clip-weights, `identity` those that must be used; see clip.py.
+    """
+    said = [demonstrations.instruction for demonstrations in recorded.values()]
+    features, identity = text_features(said, weights, identity)
+    return dict(zip(recorded, features.to(device) * told)), identity
 
 
 # ---- Pictures of recordings ----------------------------------------------------------------------
@@ -260,25 +322,6 @@ def draw_demonstration(
     write_atomically(out, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
 
 
-def parse_show(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Draws a recording of demonstrations.")
-    parser.add_argument("--show", metavar="FILE", required=True, help="draw an episode of it")
-    parser.add_argument("--episode", type=int, default=0, help="which (default: 0, the first)")
-    parser.add_argument("--out", help="the picture (default: FILE with .png)")
-    return parser.parse_args(argv)
-
-
-def show(argv: list[str] | None = None) -> None:
-    """The command line of data.py."""
-    args = parse_show(argv)
-    out = Path(args.out or args.show).with_suffix(".png")
-    recorded = load_demonstrations(args.show)
-    if not 0 <= args.episode < len(recorded):
-        raise ValueError(f"{args.show} holds episodes 0 to {len(recorded) - 1}, not {args.episode}")
-    draw_demonstration(recorded, out, args.episode)
-    print(f"wrote {out}")
-
-
 # ---- Checkpoints ---------------------------------------------------------------------------------
 
 CHECKPOINT_FORMAT = "DAMI checkpoint 1"
@@ -311,19 +354,31 @@ def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **
         temporary.unlink(missing_ok=True)
 
 
+def checkpoints_of(path: str | Path) -> list[Path]:
+    """A file as it is; of a run's folder all its EMA checkpoints, the last one last."""
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    if not (found := sorted(path.glob("ema-*.pt")) or sorted(path.glob("adapted.pt"))):
+        inside = ", ".join(str(file.parent) for file in sorted(path.glob("*/adapted.pt")))
+        instead = inside or "a folder of train.py or finetune.py, or a .pt file"
+        raise ValueError(f"{path} holds no checkpoint: name {instead}")
+    return found
+
+
 def load_checkpoint(
     path: str | Path,
     device: str | torch.device = "cpu",
     needs: Sequence[str] = (),
     sampler: str | None = None,
 ) -> tuple[DAMIPolicy, dict[str, Any]]:
-    """Rebuilds the policy of a checkpoint, in evaluation mode on `device`.
+    """Rebuilds the policy of a checkpoint, a folder's last, in evaluation mode on `device`.
 
     Returns (policy, info): info is everything else in the file. `sampler` takes the place of that
     in the configuration. Raises ValueError for a file that is missing, damaged, not one of ours,
     lacks a name in `needs`, or whose weights do not fit.
     """
-    path = Path(path)
+    path = checkpoints_of(path)[-1]
     if not path.is_file():
         raise ValueError(f"no checkpoint at {path}: name a .pt file, or train one with train.py")
     try:
@@ -392,7 +447,7 @@ def restore(
     """
     device = policy.normalizer.action_scale.device
     averaged, left = load_checkpoint(path, device, needs=("training", "data"))
-    old = left["arguments"] | asdict(averaged.config)
+    old = asdict(type(settings)()) | left["arguments"] | asdict(averaged.config)
     new = asdict(settings) | asdict(policy.config)
     if left["step"] <= old.get("multi_task_share", 0) * old["steps"]:
         old |= {name: new[name] for name in ("maml", "inner_lr", "support_only")}
@@ -411,8 +466,8 @@ def restore(
 
 # ---- Folders of runs -----------------------------------------------------------------------------
 
-RESULTS = "adapted.pt", "adapted-*.pt", "success.json", "success.md", "success.png"
-OF_ADAPTING = "config.json", "metrics.jsonl"
+RESULTS = "adapted.pt", "adapted-*.pt", "success.json", "success.md", "success.png", "held-out.md"
+OF_ADAPTING = "config.json", "metrics.jsonl", "events.out.tfevents.*"
 
 
 def claim_folder(folder: Path, overwrite: bool) -> None:
@@ -518,9 +573,43 @@ class StopRequest:
 
 
 def log(folder: Path, **values: Any) -> None:
-    """Appends a line to metrics.jsonl."""
+    """Appends a line to metrics.jsonl, and its numbers to TensorBoard's file if it is installed."""
     with (folder / "metrics.jsonl").open("a") as file:
         file.write(json.dumps(values) + "\n")
+    if (writer := tensorboard(folder)) is not None:
+        for name, value in values.items():
+            if isinstance(value, (int, float)) and name != "step":
+                writer.add_scalar(name, value, values["step"])
+
+
+@functools.cache
+def tensorboard(folder: Path) -> Any:
+    """TensorBoard's writer for a folder; None without that package."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    writer = SummaryWriter(folder, flush_secs=10)
+    atexit.register(writer.close)
+    return writer
+
+
+def begin_run(
+    folder: Path,
+    start: int,
+    settings: Flags,
+    preset: Flags,
+    config: PolicyConfig,
+    facts: dict[str, Any],
+) -> None:
+    """Prints the settings, writes them to a new run's config.json, drops what was logged later."""
+    used = asdict(settings) | asdict(config)
+    usual = asdict(preset) | asdict(PRESETS[config.policy][settings.preset])
+    print_settings(used, usual)
+    if start == 0:
+        written = {"arguments": asdict(settings), "config": asdict(config), **facts}
+        write_text(folder / "config.json", json.dumps(written, indent=1))
+    rewind_metrics(folder, start)
 
 
 def rewind_metrics(folder: Path, step: int) -> None:

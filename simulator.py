@@ -18,6 +18,7 @@ import os
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import ClassVar
@@ -110,6 +111,29 @@ def suite_tasks(suite: str) -> tuple[list[str], list[str]]:
 def check_task(task: str) -> str:
     """Returns `task` if it is one of the 50. Raises ValueError with the nearest right one."""
     return choose(task, INSTRUCTIONS, "task")
+
+
+def is_simulated(recorded: Demonstrations, path: str | Path) -> bool:
+    """Whether a recording is of a task of Meta-World; ValueError if it only has such a name."""
+    if recorded.task in INSTRUCTIONS and recorded.meta | RECIPE != recorded.meta:
+        what = f"{path} is not Meta-World's {recorded.task} as recorded here"
+        raise ValueError(f"{what}: give your task, and its file, a name of their own")
+    return recorded.task in INSTRUCTIONS
+
+
+def own_recordings(folder: str | Path) -> dict[str, Path]:
+    """Task -> file of the recordings in a folder; none if they are Meta-World's, by their names."""
+    paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
+    known, problem = [task for task in paths if task in INSTRUCTIONS], None
+    if not Path(folder).is_dir():
+        problem = f"there is no folder {folder}: with --suite ml10, experts fill it"
+    elif known and len(known) < len(paths):
+        problem = f"{folder} mixes your recordings with {known[0]}: move one kind elsewhere"
+    if problem:
+        raise ValueError(problem)
+    for task in known:
+        is_simulated(replace(load_demonstrations(paths[task]), task=task), paths[task])
+    return {} if known else paths
 
 
 def episode_seed(seed: int, episode: int) -> int:

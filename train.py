@@ -13,7 +13,6 @@ processes without changing what they draw.
 """
 
 import argparse
-import json
 import math
 import time
 from collections.abc import Iterator
@@ -32,12 +31,11 @@ from torch.optim.swa_utils import AveragedModel
 import baselines
 import evaluate
 import scripts
-from clip import text_features
-from data import Demonstrations, WindowSampler, backwards, load_demonstrations
+from data import WindowSampler, backwards, load_demonstrations
 from maml import meta_gradient
-from model import CHOICES, PRESETS, DAMIPolicy, PolicyConfig, ema_model
+from model import PRESETS, DAMIPolicy, PolicyConfig, ema_model
 from scripts import Flags, choose, command_line, progress_bar, save_checkpoint, setting
-from simulator import INSTRUCTIONS, SUITES, collect, suite_tasks
+from simulator import SUITES, collect, own_recordings, suite_tasks
 
 # ---- Settings ------------------------------------------------------------------------------------
 
@@ -67,6 +65,7 @@ class Settings(Flags):
     backwards: float = setting(0.0, "share of batches played backwards", least=0, most=1)
     support_only: float = setting(0.0, "share of inner steps told nothing else", least=0, most=1)
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
+    held_out: int = setting(0, "of them, the last so many only judge", least=0)
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
     episodes: int = setting(20, "evaluation episodes a task; 0: never evaluate", least=0)
@@ -90,7 +89,6 @@ SETTINGS = {
     ),
 }
 # fmt: on
-EVALUATION_SEED = 0  # of the goals; the same for every seed of training
 SAVE_SECONDS = 20  # between two savings of last.pt: what a killed run loses at most
 PER_WINDOW = ("points", "state", "action", "noise", "timesteps")  # of a batch; the rest: per task
 PER_WINDOW += ("times", "drop_path", "cutoffs", "mask")  # of baselines.py
@@ -270,20 +268,15 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--out", help="folder of the run (default: runs/SUITE-PRESET-seedSEED)")
     add("--resume", action="store_true", help="go on from the run's last.pt")
     scripts.add_common_flags(add)
-    add = parser.add_argument_group("architecture (default: the preset's)").add_argument
-    for name, choices in CHOICES.items():
-        add(f"--{name.replace('_', '-')}", choices=choices, help="see model.PolicyConfig")
-    add("--num-points", type=int, help="points of each cloud that the policy reads")
-    Settings.add_flags(parser.add_argument_group("settings (default: the preset's)"))
+    scripts.add_architecture_flags(parser)
+    Settings.add_flags(parser.add_argument_group("settings (default: the preset's)"), SETTINGS)
     return parser.parse_args(argv)
 
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
     device = scripts.pick_device(args.device)
-    own = {}  # task -> file
-    if args.data and not args.suite:
-        own = scripts.own_recordings(args.data, INSTRUCTIONS)
+    own = own_recordings(args.data) if args.data and not args.suite else {}  # task -> file
     default = "paper" if device.type == "cuda" else "small"
     preset = choose(args.preset or default, PRESETS, "preset")
     suite = "own" if own else choose(args.suite or "ml10", SUITES, "suite")
@@ -335,45 +328,32 @@ def run(
     recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
     config = scripts.choose_config(args, settings.preset, recorded, settings.suite == "own")
 
-    def windows(demonstrations: dict[str, Demonstrations]) -> dict[str, WindowSampler]:
-        how = (config, device, rest, settings.augment)
-        return {task: WindowSampler(d, *how) for task, d in demonstrations.items() if d is not None}
-
-    samplers = windows(recorded)
+    recorded, held = evaluate.hold_out(recorded, settings.held_out)
     back = {t: backwards(d, rest or 0) for t, d in recorded.items()} if settings.backwards else {}
-    undone = windows(back)
+    how = (config, device, rest, settings.augment)
+    shown = n and n - settings.held_out  # demonstrations for rollouts
+    samplers, unseen, undone = (scripts.windows(part, *how) for part in (recorded, held, back))
     policy, ema, optimizer = initialize(config, settings, samplers, device)
     data = scripts.digest(samplers)
     left = {"step": 0, "seconds": 0.0, "text_weights": None}
     if args.resume:
         left = scripts.restore(folder / "last.pt", policy, ema, optimizer, settings, data)
     start, seconds = left["step"], left["seconds"]
-    said = [d.instruction for d in recorded.values()]
-    features, identity = text_features(said, args.clip_weights, left["text_weights"])
-    text = dict(zip(recorded, features.to(device)))  # each (text_dim,)
+    how = args.clip_weights, left["text_weights"], device
+    text, identity = scripts.instruction_features(recorded, *how)
 
     # What is written beside the weights, and beside the results
     about = {"suite": settings.suite, "preset": settings.preset, "text_weights": identity}
     about["arguments"] = asdict(settings)
     facts = {"text weights": identity, **facts}
-    if leader and start == 0:
-        written = {"arguments": asdict(settings), "config": asdict(config), **facts}
-        scripts.write_text(folder / "config.json", json.dumps(written, indent=1))
     if leader:
-        scripts.rewind_metrics(folder, start)
-
-    def measure(step: int) -> evaluate.Successes | None:
-        """Evaluates the checkpoint of this step if that is due, and was not done before."""
-        due = step == settings.steps or (step and step % settings.evaluate_every == 0)
-        if not leader or not settings.episodes or not due:
-            return None
-        protocol = (settings.episodes, EVALUATION_SEED, args.workers, device, n)
-        with stop.at_once():  # everything is saved
-            return evaluate.evaluate_step(folder, step, paths, text, *protocol)
+        scripts.begin_run(folder, start, settings, SETTINGS[settings.preset], config, facts)
 
     bar = {"desc": "training", "unit": "step", "total": settings.steps, "initial": start}
     with scripts.StopRequest() as stop, progress_bar(**bar, disable=not leader) as progress:
-        measure(start)  # the run may have been stopped while it was measured
+        how = settings, stop, paths, text, args.workers, device, shown
+        if leader:
+            evaluate.evaluate_step(folder, start, *how)  # the run may have been stopped meanwhile
         began = saved = time.monotonic()
         training = meta_train(
             policy, ema, optimizer, samplers, text, settings, undone, start, rank, world
@@ -398,23 +378,14 @@ def run(
             if stop.requested and step < settings.steps:
                 raise KeyboardInterrupt(f"saved after step {step}, add --resume to go on")
             if leader and milestone:
+                evaluate.judge(folder, step, ema.module, samplers, unseen, text)
                 evaluate.draw_curves(folder)
-                measure(step)
+                evaluate.evaluate_step(folder, step, *how)
             began = time.monotonic()
 
-        successes = measure(settings.steps)
     if leader:
-        evaluate.draw_curves(folder)
-
-    if successes:
-        facts |= {"title": f"{settings.suite}, base tasks, {settings.preset}, {config.policy}"}
-        facts |= {"episodes a task": settings.episodes, "seed": EVALUATION_SEED}
-        facts |= {"training": f"{seconds / 60:.1f} min", "training seed": settings.seed}
-        columns = {"last checkpoint": successes}
-        print(f"\n{evaluate.write_report(folder, columns, facts, settings.suite)}")
-    if leader:
-        files = ", ".join(sorted(path.name for path in folder.iterdir()))
-        print(f"\n{folder} is finished: {files}")
+        successes = evaluate.evaluate_step(folder, settings.steps, *how)
+        evaluate.report_training(folder, settings, config.policy, seconds, facts, successes)
 
 
 if __name__ == "__main__":

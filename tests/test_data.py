@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import convert
 import data
 import scripts
 from data import Demonstrations, WindowSampler
@@ -414,7 +415,7 @@ def test_a_setting_out_of_bounds_is_refused_in_the_words_of_the_command_line(cha
 
 def test_show_draws_a_picture(tmp_path, capsys):
     data.save_demonstrations(tmp_path / "reach.npz", recording())
-    scripts.show(["--show", str(tmp_path / "reach.npz")])
+    convert.main(["--show", str(tmp_path / "reach.npz")])
     assert (tmp_path / "reach.png").stat().st_size > 10_000
     assert "reach.png" in capsys.readouterr().out
 
@@ -426,7 +427,7 @@ def say(error):
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda: scripts.show(["--show", "nothing.npz"]), "nothing.npz is missing"),
+        (lambda: convert.main(["--show", "nothing.npz"]), "nothing.npz is missing"),
         (lambda: scripts.choose("shelf-plce", ["shelf-place", "push"], "task"), "'shelf-place'?"),
         (lambda: scripts.choose("x", ["push", "pull"], "task"), "choose one of: pull, push"),
         (lambda: say(PermissionError("no access")), "no access"),

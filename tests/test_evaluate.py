@@ -1,14 +1,19 @@
 """Tests of evaluate.py: figures, which checkpoint, rollouts, the policy that ships, bad input."""
 
 import json
+import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 from conftest import BASE, fails
 
 import clip
+import data
 import evaluate
 import finetune
 import model
@@ -43,6 +48,15 @@ def test_a_table_has_a_row_a_task_the_mean_and_the_papers_figures():
     assert rows[4][1] == evaluate.format_success(3, 4)
     paper = [evaluate.paper_success("ml10", task) for task in ("reach", "drawer-close")]
     assert [row[2] for row in rows[2:]] == [f"{value:.1f}" for value in (*paper, sum(paper) / 2)]
+
+
+def test_base_and_novel_tasks_have_means_of_their_own_and_columns_are_aligned():
+    successes = {"reach": [True], "window-open": [True], "door-close": [False]}
+    table = evaluate.success_table({"ours": successes}, "ml10").splitlines()
+    assert len({len(line) for line in table}) == 1
+    means = {line.split("|")[1].strip(): line.split("|")[2].split()[0] for line in table[5:]}
+    assert means == {"**mean of base**": "100.0", "**mean of novel**": "0.0"}
+    assert "**mean** " in evaluate.success_table({"ours": successes})  # of no suite
 
 
 # ---- Which checkpoint ----------------------------------------------------------------------------
@@ -188,7 +202,124 @@ def test_a_rollout_can_be_watched(run, recorded, monkeypatch, capsys):
     evaluate.main(evaluating(run, recorded, "--task reach --gif reach.gif"))
     assert Path("reach.gif").read_bytes().startswith(b"GIF8")
     assert Path("reach.gif").stat().st_size > 10_000
-    assert "wrote reach.gif" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "wrote reach.gif" in printed.out
+    assert "rolling out: 4chunk" in printed.err and "drawing: 100%" in printed.err
+
+
+def test_an_adapted_policy_is_watched_from_its_folder(run, recorded, monkeypatch, capsys):
+    seen = []
+    monkeypatch.setattr(
+        evaluate, "write_gif", lambda policy, sampler, *_: seen.append(sampler.task)
+    )
+    info = torch.load(run / "ema-00006.pt", weights_only=True)
+    Path("all/door-close").mkdir(parents=True)
+    torch.save(info | {"adapted_to": "door-close"}, "all/door-close/adapted.pt")
+    argv = ["--data", str(recorded), *"--demonstrations 2 --gif door.gif --checkpoint".split()]
+    evaluate.main([*argv, "all/door-close"])
+    assert seen == ["door-close"] and "is novel" not in capsys.readouterr().out
+    assert "holds no checkpoint: name all/door-close" in fails(evaluate, [*argv, "all"], capsys)
+    evaluate.main([*argv, str(run), "--task", "door-close"])
+    assert "door-close is novel to this policy: `python finetune.py" in capsys.readouterr().out
+
+
+def test_a_movie_is_written_by_what_is_there(monkeypatch):
+    assert evaluate.movie_writer("x.gif").fps == 8
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ValueError, match="install ffmpeg or `pip install imageio-ffmpeg`"):
+        evaluate.movie_writer("x.mp4")
+    package = SimpleNamespace(get_ffmpeg_exe=lambda: sys.executable)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", package)
+    assert evaluate.movie_writer("x.mp4").bin_path() == sys.executable
+    with pytest.raises(ValueError, match="there is no such folder"):
+        evaluate.movie_writer("none/x.gif")
+
+
+def test_a_folder_stands_for_its_last_checkpoint(run):
+    info = scripts.load_checkpoint(run)[1]
+    assert info["step"] == 6 and len(scripts.checkpoints_of(run)) == 2
+
+
+TABLE = """
+<mujoco>
+  <worldbody>
+    <camera name="corner" pos="0 -1 1" xyaxes="1 0 0 0 1 1" fovy="50"/>
+    <geom name="table" type="box" pos="0 0 -0.02" size="1 1 0.01"/>
+    <body name="hand">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="y" type="slide" axis="0 1 0"/>
+      <geom type="sphere" size="0.08" pos="0 0 0.1" mass="1"/>
+    </body>
+    <site name="goal" type="sphere" size="0.05" pos="0 0 0.1" rgba="1 0 0 1"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+class Table:
+    """A hand on a table, in MuJoCo but not in Meta-World: the three methods of `Environment`."""
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(TABLE)
+        self.data = mujoco.MjData(self.model)
+        box = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.3))
+        self.camera = simulator.RayCastCamera(self.model, 40, box, "corner")
+
+    def reset(self, *, seed):
+        mujoco.mj_resetData(self.model, self.data)
+        self.steps, self.goal = 0, np.random.default_rng(seed).uniform(0.2, 0.3, 2)
+        self.model.site("goal").pos[:2] = self.goal
+        return self.observe(), {}
+
+    def advance(self, action):
+        self.data.qpos += 0.02 * np.clip(action, -1, 1)
+        self.steps += 1
+        near = bool(np.abs(self.data.qpos - self.goal).max() < 0.03)
+        return 0.0, self.steps >= 40, {"success": near}
+
+    def observe(self):
+        mujoco.mj_forward(self.model, self.data)
+        cloud = data.farthest_point_sample(self.camera.points(self.data), 64)
+        return {"point_cloud": cloud, "agent_pos": self.data.qpos.astype(np.float32)}
+
+
+def test_your_own_simulator_is_rolled_out_in(monkeypatch):
+    env: evaluate.Environment = Table()
+    frames, ends = [], [20, 40]
+    for seed in (0, 1):
+        observation, _ = env.reset(seed=seed)
+        for _ in range(20):
+            action = (50 * (env.goal - observation["agent_pos"])).clip(-1, 1)
+            frames.append((observation["point_cloud"], observation["agent_pos"], action))
+            env.advance(action)
+            observation = env.observe()
+    points, state, action = (np.stack(x).astype(np.float32) for x in zip(*frames))
+    recorded = data.Demonstrations("go", "Go there.", points, state, action, np.array(ends), {})
+    assert recorded.problem() is None
+    goals = points[points[..., 0] > 0.12]  # not the hand where it begins, but the marker
+    assert len(goals) and np.abs(goals[:, 2] - 0.1).max() < 0.15
+
+    policy = model.DAMIPolicy(replace(model.PRESETS["tiny"], state_dim=2, action_dim=2))
+    sampler, text = data.WindowSampler(recorded, policy.config), torch.zeros(512)
+    envs, seen = [Table(), Table()], []
+
+    def rollout():
+        generator = torch.Generator().manual_seed(0)
+        watch = lambda e, observation: seen.append(observation["agent_pos"])  # noqa: E731
+        return evaluate.rollout(policy, envs, [5, 6], sampler, text, generator, watch)
+
+    assert all(type(success) is bool for success in rollout())
+    assert all(env.steps <= 40 for env in envs) and seen
+
+    def toward(points, state, context, generator):
+        goals = torch.tensor(np.array([env.goal for env in envs])).float()
+        return (50 * (goals - state[:, -1])).clip(-1, 1)[:, None].expand(-1, 8, -1)
+
+    monkeypatch.setattr(policy, "sample_actions", toward)
+    assert rollout() == [True, True] and all(env.steps < 40 for env in envs)
+    monkeypatch.setattr(policy, "sample_actions", lambda *a: -toward(*a))
+    assert rollout() == [False, False] and all(env.steps == 40 for env in envs)
 
 
 # ---- Bad input -----------------------------------------------------------------------------------
@@ -200,7 +331,7 @@ def test_a_rollout_can_be_watched(run, recorded, monkeypatch, capsys):
         ("--checkpoint none.pt", "none.pt"),
         ("--episodes 0", "--episodes is 0: use at least 1"),
         ("--gif reach.gif", "name its task"),
-        ("--task reach --gif reach.mp4", "reach.gif"),
+        ("--task reach --gif reach.avi", "name it .gif or .mp4"),
         ("--seed -1", "seed"),
         ("--task raech", "did you mean 'reach'?"),
         ("--suite ml-45", "did you mean 'ml45'?"),
@@ -238,3 +369,71 @@ def test_a_command_ends_quietly_or_in_one_line(capsys):
     with pytest.raises(SystemExit) as end:
         scripts.command_line(lambda: (_ for _ in ()).throw(KeyboardInterrupt()))
     assert end.value.code == 130
+
+
+# ---- Held-out episodes ---------------------------------------------------------------------------
+
+
+def numbered(lengths, frames=None):
+    """A recording whose actions tell the episode and the frame: 10 e + 0.01 t."""
+    counts = [np.full(n, 10 * e) + 0.01 * np.arange(n) for e, n in enumerate(lengths)]
+    action = np.repeat(np.concatenate(counts)[:, None], 4, axis=1).astype(np.float32)
+    points = np.random.default_rng(0).normal(size=(len(action), 64, 3)).astype(np.float16)
+    state = np.zeros((len(action), 9), np.float32)
+    meta = {} if frames is None else {"success_frames": frames}
+    ends = np.cumsum(lengths)
+    return data.Demonstrations("stir", "Stir.", points, state, action, ends, meta)
+
+
+def test_the_last_episodes_are_held_out():
+    recorded = numbered([30, 20, 40, 25], frames=[1, 2, 3, 4]).take(3)
+    kept, held = evaluate.hold_out({"stir": recorded}, 2)
+    assert kept["stir"].episode_ends.tolist() == [30] and len(kept["stir"].action) == 30
+    assert held["stir"].episode_ends.tolist() == [20, 60] and held["stir"].problem() is None
+    assert held["stir"].meta["success_frames"] == [2, 3]
+    np.testing.assert_array_equal(held["stir"].action, recorded.action[30:90])
+    assert evaluate.hold_out({"stir": recorded}, 0)[1] == {}
+    with pytest.raises(ValueError, match="stir has 3 episodes: use a --held-out below that"):
+        evaluate.hold_out({"stir": recorded}, 3)
+
+
+def test_the_action_error_is_the_mean_absolute_error_over_executed_chunks(monkeypatch):
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    kept, held = evaluate.hold_out({"stir": numbered([30, 40, 12])}, 2)
+    shown, unseen = (data.WindowSampler(part["stir"], policy.config) for part in (kept, held))
+    shown_to, drawn = [], []
+
+    def draw(points, state, context, generator):
+        shown_to.append(context)
+        drawn.append(torch.full((len(points), 8, 4), 10.5))
+        return drawn[-1]
+
+    monkeypatch.setattr(policy, "sample_actions", draw)
+    monkeypatch.setattr(policy, "encode_demo", lambda text, demo_action, **_: demo_action)
+    error, plain = evaluate.action_error(policy, shown, unseen, torch.zeros(512))
+    # Episode 1: chunks at 0, 8, 16, 24, 32; episode 2 has 12 frames: one window, from frame 0.
+    first, second = 10 + 0.01 * np.arange(40), 20 + 0.01 * np.arange(8)
+    assert [len(chunks) for chunks in drawn] == [5, 1]
+    actions = np.concatenate([first, second])
+    assert error == pytest.approx(np.abs(actions - 10.5).mean(), rel=1e-4)
+    assert plain == pytest.approx(np.abs(actions - 0.01 * 14.5).mean(), rel=1e-4)
+    assert all((demo < 10).all() for demo in shown_to)  # an episode that was trained on
+
+
+def test_a_policy_that_fits_its_demonstrations_has_a_small_action_error():
+    """A policy that has learned one episode draws it; an untrained one does not."""
+    config = replace(model.PRESETS["tiny"], demo_encoder="none", tcfm="none", inference_steps=2)
+    torch.manual_seed(0)
+    policy, recorded = model.DAMIPolicy(config), numbered([40, 40])
+    recorded.state[:] = np.linspace(-1, 1, 40).repeat(1)[np.arange(80) % 40][:, None]
+    recorded.points[40:], recorded.action[40:] = recorded.points[:40], recorded.action[:40]
+    kept, held = evaluate.hold_out({"stir": recorded}, 1)
+    shown, unseen = (data.WindowSampler(part["stir"], config) for part in (kept, held))
+    policy.normalizer.fit(shown.points, shown.state, shown.action)
+    before, plain = evaluate.action_error(policy, shown, unseen, torch.zeros(512))
+    adapting = finetune.adapt_policy(
+        policy, shown, torch.zeros(512), 150, 32, dict.fromkeys(finetune.LEARNING_RATES, 3e-3)
+    )
+    *_, (_, _, adapted) = adapting
+    after, _ = evaluate.action_error(adapted, shown, unseen, torch.zeros(512))
+    assert after < 0.3 * plain < before

@@ -643,3 +643,53 @@ def test_where_only_the_demonstration_tells_the_task_it_is_read():
     own, other = demonstrations(), {name: x.flip(0) for name, x in demonstrations().items()}
     torch.testing.assert_close(sampled(own), torch.tensor([0.5, -0.5]), atol=0.15, rtol=0)
     torch.testing.assert_close(sampled(other), torch.tensor([-0.5, 0.5]), atol=0.15, rtol=0)
+
+
+# ---- Used alone: one line for each way of getting it wrong ---------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"demo_points": None}, r"demo_points is missing, the policy takes \(D, T, N, 3\)"),
+        ({"text": None}, r"text is missing, the policy takes \(D, 512\)"),
+        ({"text": (512,)}, r"text is \(512,\), the policy takes \(D, 512\)"),
+        ({"text": (1, 768)}, r"text is \(1, 768\), the policy takes \(1, 512\)"),
+        ({"action": (6, 8, 4)}, r"action is \(6, 8, 4\), the policy takes \(6, 16, 4\)"),
+        ({"points": (2, 64, 3)}, r"points is \(2, 64, 3\), the policy takes \(B, 2, N, 3\)"),
+        ({"points": (64, 3)}, r"points is \(64, 3\), the policy takes \(B, 2, N, 3\)"),
+        ({"points": (6, 2, 3)}, r"points is \(6, 2, 3\), the policy takes \(B, 2, N, 3\)"),
+        ({"points": (6, 2, 64, 2)}, r"points is \(6, 2, 64, 2\), the policy takes \(6, 2, 64, 3\)"),
+        ({"points": (6, 2, 64, 6)}, r"points is \(6, 2, 64, 6\), the policy takes \(6, 2, 64, 3\)"),
+        ({"points": (6, 1, 64, 3)}, r"points is \(6, 1, 64, 3\), the policy takes \(6, 2, 64, 3\)"),
+        ({"state": (2, 9)}, r"state is \(2, 9\), the policy takes \(B, 2, 9\)"),
+        ({"demo_state": (1, 9, 9)}, r"demo_state is \(1, 9, 9\), the policy takes \(1, 10, 9\)"),
+    ],
+)
+def test_wrong_inputs_are_refused_with_both_shapes(changes, message):
+    policy = DAMIPolicy(PRESETS["tiny"])
+    given = {name: x and torch.zeros(x) for name, x in changes.items()}
+    with pytest.raises(ValueError, match=message):
+        policy.loss(**random_batch(policy.config) | given)
+
+
+def test_a_policy_that_reads_a_task_does_not_act_without_one():
+    policy = DAMIPolicy(PRESETS["tiny"])
+    batch = random_batch(policy.config)
+    with pytest.raises(ValueError, match="context is missing: it is what `encode_demo` makes"):
+        policy.sample_actions(batch["points"], batch["state"], None)
+    alone = new_policy(demo_encoder="none", tcfm="none")
+    assert alone.sample_actions(batch["points"], batch["state"], None).shape == (6, 8, 4)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"kernel_size": 4}, r"kernel_size \+ 1 by 2 \(use an odd one\): 5 by 2"),
+        ({"horizon": 15}, "horizon by 2 for each level of the U-Net but the last: 15 by 2"),
+        ({"horizon": 4}, "n_action_steps 8: horizon 4 has 3 after observation 2"),
+    ],
+)
+def test_a_policy_that_cannot_be_is_refused_where_it_is_made(changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(PRESETS["tiny"], **changes)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-import scripts
+import convert
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -38,7 +38,7 @@ def test_every_command_parses(command, capsys, monkeypatch):
     elif words[0] == "torchrun":
         importlib.import_module("train").parse(words[words.index("train.py") + 1 :])
     elif words[1] == "data.py":
-        scripts.parse_show(words[2:])
+        convert.parse(words[2:])
     elif words[1].removesuffix(".py") in PARSERS:
         importlib.import_module(words[1].removesuffix(".py")).parse(words[2:])
     elif words[1] == "-m":

@@ -24,6 +24,7 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 import clip
+import convert
 import data
 import model
 import robot
@@ -1006,7 +1007,7 @@ def test_recording_keeps_finished_episodes_and_drops_the_others(
     longer = data.load_demonstrations("demos/stack-cube.npz")
     assert len(longer) == 3 and len(longer.meta["time_s"]) == len(longer.state)
     np.testing.assert_array_equal(longer.state[: len(recorded.state)], recorded.state)
-    scripts.show(["--show", "demos/stack-cube.npz"])
+    convert.main(["--show", "demos/stack-cube.npz"])
     assert Path("demos/stack-cube.png").read_bytes().startswith(b"\x89PNG")
     emulator.tcp_offset = (0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
     Typing(monkeypatch, (0.1, "q"))

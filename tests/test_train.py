@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,6 +46,15 @@ def test_every_setting_is_a_flag_and_is_kept(run):
     args = train.parse([])
     assert all(hasattr(args, name) for name in asdict(train.Settings()))
     assert weights(run / "ema-00006.pt")[1]["arguments"].keys() == asdict(train.Settings()).keys()
+
+
+def test_help_says_each_presets_value(capsys):
+    with pytest.raises(SystemExit):
+        train.parse(["--help"])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "outer steps (paper 54000, small 10000, tiny 30)" in printed
+    assert "of weights, batches and noise (0)" in printed
+    assert "points of a cloud (paper 512, small 128, tiny 64)" in printed
 
 
 def test_the_learning_rate_warms_up_and_falls_to_zero_along_a_cosine():
@@ -132,9 +142,9 @@ def test_training_leaves_everything_that_it_promises(run):
     assert list(successes) == BASE and all(len(episodes) == 2 for episodes in successes.values())
     assert evaluated["successes"] == successes
     assert evaluated["success"] == evaluate.mean_success(successes)
-    assert report["facts"]["seed"] == train.EVALUATION_SEED == 0
+    assert report["facts"]["seed"] == evaluate.EVALUATION_SEED == 0
     table = (run / "success.md").read_text()
-    assert all(f"| {task} |" in table for task in BASE)
+    assert all(f"| {task} " in table for task in BASE)
     assert "paper" in table and "random-seed-0" in table
     for name in ("curves.png", "success.png"):
         assert (run / name).read_bytes().startswith(b"\x89PNG")
@@ -314,6 +324,38 @@ def test_torchruns_variables_alone_end_in_one_line(monkeypatch, capsys, recorded
     assert "RANK" in fails(train, [*FEW, "--data", recorded], capsys)
 
 
+def test_numbers_go_to_tensorboard_where_it_is_installed(tmp_path, monkeypatch):
+    written = []
+
+    class Writer:
+        def __init__(self, folder, **_):
+            self.folder = folder
+
+        def add_scalar(self, *values):
+            written.append((self.folder, *values))
+
+        def close(self):
+            pass
+
+    package = SimpleNamespace(SummaryWriter=Writer)
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", package)
+    scripts.log(tmp_path, step=3, loss=0.5, lr=1, successes={"reach": [True]})
+    assert written == [(tmp_path, "loss", 0.5, 3), (tmp_path, "lr", 1, 3)]
+    assert metrics(tmp_path)[0]["successes"] == {"reach": [True]}
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    scripts.log(tmp_path / "..", step=4, loss=0.5)
+    assert len(written) == 2
+
+
+@pytest.mark.parametrize("module", ["scripts", "robot"])
+def test_windows_is_told_in_one_line_what_to_use(module):
+    program = f"import sys; sys.modules.update(fcntl=None, termios=None, tty=None); import {module}"
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "needs Linux or macOS; on Windows, run it under WSL" in done.stderr
+
+
 def test_lines_of_metrics_that_were_cut_are_dropped(tmp_path):
     for step in (1, 2, 3):
         scripts.log(tmp_path, step=step, loss=0.5)
@@ -349,6 +391,50 @@ def test_own_recordings_of_any_length_and_dimension_are_trained_on_and_adapted_t
     finetune.main(["--data", "own/pour.npz", *checkpoint, "--steps", "2"])
     assert weights("runs/finetune/pour-seed0/adapted.pt")[1]["adapted_to"] == "pour"
     assert "base tasks" not in capsys.readouterr().out
+
+
+def test_held_out_episodes_only_judge(capsys):
+    Path("own").mkdir()
+    for task in ("stir", "pour"):
+        np.savez(f"own/{task}.npz", **own_recording(90, ends=[60, 90], task=task))
+    argv = "--preset tiny --steps 2 --checkpoint-every 1 --data own --clip-weights random".split()
+    train.main([*argv, "--out", "runs/judged", "--held-out", "1"])
+    printed = capsys.readouterr().out
+    assert "held-out action error" in printed and re.search(r"\| held_out +\| 1 +\| 0 +\|", printed)
+    assert "next: python finetune.py --data NEW.npz --checkpoint runs/judged" in printed
+    train.main([*argv, "--out", "runs/first", "--demonstrations", "1"])
+    judged, first = (whole_state(Path(f"runs/{name}")) for name in ("judged", "first"))
+    assert same_bits(judged, first)
+
+    folder = Path("runs/judged")
+    lines = [line for line in metrics(folder) if "action_error" in line]
+    assert [line["step"] for line in lines] == [1, 2]
+    for line in lines:
+        assert line["action_errors"].keys() == {"stir", "pour"}
+        assert line["action_error"] == pytest.approx(np.mean([*line["action_errors"].values()]))
+    table = (folder / "held-out.md").read_text()
+    assert re.search(r"\| held-out action error +\| step 1 +\| step 2 +\| the mean action", table)
+    assert f"{lines[1]['action_errors']['stir']:.4f}" in table
+    message = fails(train, [*argv, "--out", "runs/none", "--held-out", "2"], capsys)
+    assert "has 2 episodes: use a --held-out below that" in message
+
+    options = "--checkpoint runs/judged --held-out 1 --steps 2".split()
+    finetune.main(["--data", "own/stir.npz", *options])
+    lines = metrics(Path("runs/finetune/stir-seed0"))
+    assert [line["step"] for line in lines if "action_error" in line] == [0, 2]
+    assert "| step 0" in capsys.readouterr().out
+
+
+def test_a_run_of_an_older_version_which_lacks_a_setting_is_resumed(run, recorded, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    last = torch.load(run / "last.pt", weights_only=True)
+    del last["arguments"]["held_out"]
+    torch.save(last, tmp_path / "run" / "last.pt")
+    options = "--episodes 2 --evaluate-every 6".split()
+    argv = [*FEW, *options, "--data", str(recorded), "--out", str(tmp_path / "run")]
+    train.main([*argv, "--resume"])
+    with pytest.raises(ValueError, match="held_out 0 -> 1"):
+        train.main([*argv, "--resume", "--held-out", "1"])
 
 
 # ---- Bad input -----------------------------------------------------------------------------------
@@ -409,6 +495,12 @@ def test_what_cannot_be_resumed_is_said(run, recorded, tmp_path, capsys):
         shutil.copy(recorded / "reach.npz", f"mixed/{name}.npz")
     message = fails(train, ["--preset", "tiny", "--data", "mixed"], capsys)
     assert "mixes your recordings with reach" in message
+    Path("alone").mkdir()
+    np.savez("alone/hammer.npz", **own_recording(task="hammer", state_dim=7))
+    for script, data_ in ((train, "alone"), (finetune, "alone/hammer.npz")):
+        message = fails(script, ["--data", data_], capsys)
+        assert "alone/hammer.npz is not Meta-World's hammer as recorded here: give your" in message
+    assert [path.name for path in Path("alone").iterdir()] == ["hammer.npz"]
 
 
 def test_a_run_is_not_resumed_on_other_recordings(recorded, tmp_path, capsys):
