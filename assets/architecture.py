@@ -1,20 +1,27 @@
-"""Draws assets/architecture.png, the picture in the README: python assets/architecture.py"""
+"""Draws assets/architecture.png, the picture in the README: python assets/architecture.py
+
+Above the network with its shapes, below its two trainings. The background is drawn, too, so that
+the picture reads the same on a white and on a black page. Letters are those of model.py.
+"""
 
 from pathlib import Path
 
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
-DATA, NETWORK, FROZEN = (
-    "#f3e3c3",
-    "#c9dcf2",
-    "#dddddd",
-)  # light fills with dark text: legible on white and on black
-LINE = "#8a8a8a"
+DATA, NETWORK, FROZEN, WEIGHTS, LOSS = "#f6e3b4", "#bcd8f2", "#d5d5d5", "#c8e6c0", "#f4c7c3"
+LEGEND = {
+    "data": DATA,
+    "network, trained": NETWORK,
+    "network, frozen": FROZEN,
+    "weights": WEIGHTS,
+    "loss": LOSS,
+}
+PAGE, PANEL, INK, LINE = "#ffffff", "#f3f4f6", "#1a1a1a", "#4a4a4a"
 
-figure = Figure(figsize=(11, 4.6))
+figure = Figure(figsize=(11, 9.2), facecolor=PAGE)
 axes = figure.add_axes((0, 0, 1, 1))
-axes.set(xlim=(0, 110), ylim=(0, 46))
+axes.set(xlim=(0, 110), ylim=(-46, 46))
 axes.set_axis_off()
 
 
@@ -27,57 +34,123 @@ def box(
         FancyBboxPatch((x, y), width, height, boxstyle=style, facecolor=color, edgecolor=LINE)
     )
     lines = text.count("\n") + 1
-    middle = y + height / 2
-    axes.text(
-        x + width / 2,
-        middle + 1.1 * lines,
-        title,
-        ha="center",
-        va="center",
-        fontsize=10,
-        weight="bold",
-        color="#222222",
-    )
-    axes.text(
-        x + width / 2, middle - 1.1, text, ha="center", va="center", fontsize=8, color="#222222"
-    )
+    middle, center = y + height / 2, x + width / 2
+    place = {"ha": "center", "va": "center", "color": INK}
+    axes.text(center, middle + 1.1 * lines, title, fontsize=10, weight="bold", **place)
+    axes.text(center, middle - 1.1, text, fontsize=8, **place)
 
 
-def arrow(*corners: tuple[float, float], label: str = "", at: tuple[float, float] = (0, 0)) -> None:
-    """Straight lines through the corners, the last with a head."""
-    axes.plot(*zip(*corners[:-1]), color=LINE, linewidth=1.4, solid_capstyle="round")
+def panel(x: float, y: float, width: float, height: float, title: str) -> None:
+    """A field with a title, on which boxes lie."""
+    style = "round,pad=0,rounding_size=1"
     axes.add_patch(
-        FancyArrowPatch(
-            *corners[-2:], arrowstyle="-|>", mutation_scale=12, color=LINE, linewidth=1.4, shrinkA=0
-        )
+        FancyBboxPatch((x, y), width, height, boxstyle=style, facecolor=PANEL, edgecolor="#d0d0d0")
     )
-    axes.text(*at, label, fontsize=8, color=LINE, ha="center", va="center")
+    axes.text(
+        x + 1.5, y + height - 2.2, title, fontsize=10.5, weight="bold", color=INK, va="center"
+    )
 
 
-box(1, 35, 19, "Instruction", "one sentence", DATA)
-box(1, 21, 19, "Demonstration", "T clouds, states, actions:\none complete episode", DATA)
-box(1, 7, 19, "Observation", "2 clouds and states:\nnow and just before", DATA)
+def arrow(
+    *corners: tuple[float, float], label: str = "", at: tuple[float, float] = (0, 0), dashed=False
+) -> None:
+    """Straight lines through the corners, the last with a head."""
+    style = {"color": LINE, "linewidth": 1.4, "linestyle": "--" if dashed else "-"}
+    axes.plot(*zip(*corners[:-1]), solid_capstyle="round", **style)
+    axes.add_patch(
+        FancyArrowPatch(*corners[-2:], arrowstyle="-|>", mutation_scale=12, shrinkA=0, **style)
+    )
+    axes.text(*at, label, fontsize=8, color=INK, ha="center", va="center")
 
-box(26, 35, 17, "CLIP text tower", "frozen", FROZEN)
-box(26, 7, 17, "PointNet + MLP", "a frame to a feature,\nthe same for both", NETWORK, height=22)
-box(49, 21, 15, "VMT", "Transformer over T\nframes and actions", NETWORK)
-box(49, 7, 15, "$h_k$", "MLP of the feature\nand of step k", NETWORK)
-box(70, 21, 15, "U2T", "$h_k$ attends to\nframes and text", NETWORK)
-box(91, 7, 18, "U-Net", "first level: FiLM by U2T\n(TCFM); others: by $h_k$", NETWORK, height=22)
-box(91, 35, 18, "Actions", "16 predicted,\n8 executed", DATA)
 
-arrow((20, 39), (26, 39))
-arrow((20, 25), (26, 25))
-arrow((20, 11), (26, 11))
-arrow((43, 39), (77.5, 39), (77.5, 29), label="(512)", at=(60, 40.3))
-arrow((43, 25), (49, 25))
-arrow((43, 11), (49, 11))
-arrow((64, 25), (70, 25))
-arrow((64, 11), (91, 11), label="$h_k$", at=(81, 12.3))
-arrow((74, 11), (74, 21))
-arrow((85, 25), (91, 25))
-arrow((96, 29), (96, 35), label="$A_0$", at=(93.7, 32))
-arrow((105, 35), (105, 29), label="$A_{k-10}$", at=(101.5, 32))
-arrow((100, 3), (100, 7), label="starts from noise, $k$ = 90, 80, ... 0", at=(86, 3.6))
+# The network
+panel(0.5, 1, 109, 44.5, "The network")
+box(2, 31, 19, "Instruction", "one sentence", DATA)
+box(2, 18, 19, "Demonstration", "one complete episode:\n(T, N, 3), (T, S), (T, A)", DATA)
+box(2, 5, 19, "Observation", "now and just before:\n(To, N, 3), (To, S)", DATA)
 
-figure.savefig(Path(__file__).with_suffix(".png"), dpi=110, transparent=True)
+box(29, 31, 16, "CLIP", "text tower", FROZEN)
+box(29, 5, 16, "PointNet + MLP", "a frame to a feature,\nthe same weights\nfor both", NETWORK, 21)
+box(53, 18, 13.5, "VMT", "Transformer over\nframes and actions", NETWORK)
+box(53, 5, 13.5, "$h_k$", "MLP of the features\nand of step k", NETWORK)
+box(75, 18, 13, "U2T", "$h_k$ attends to\nframes and text", NETWORK)
+box(93, 5, 15, "U-Net", "first level:\nFiLM by U2T\n(TCFM);\nothers: by $h_k$", NETWORK, 21)
+box(93, 33, 15, "Actions", "(H, A) = (16, A),\n8 executed", DATA)
+
+arrow((21, 35), (29, 35))
+arrow((21, 22), (29, 22))
+arrow((21, 9), (29, 9))
+arrow((45, 35), (81.5, 35), (81.5, 26), label="(512)", at=(62, 36.3))
+arrow((45, 22), (53, 22), label="(T, feature)", at=(49, 25))
+arrow((45, 9), (53, 9), label="(To, feature)", at=(49, 12))
+arrow((66.5, 22), (75, 22), label="(T, demo_dim)", at=(70.7, 23.4))
+arrow((66.5, 9), (93, 9), label="(C)", at=(85, 10.4))
+arrow((79, 9), (79, 18))
+arrow((88, 22), (93, 22), label="(C)", at=(90.5, 23.4))
+arrow((97, 26), (97, 33), label=r"$\hat A_0$", at=(95.2, 29.5))
+arrow((104, 33), (104, 26), label="$A_{k-10}$", at=(106.8, 29.5))
+arrow((100.5, 1.8), (100.5, 5), label="starts from noise; k = 90, 80, ... 0", at=(88.5, 2.8))
+
+# Meta-training
+panel(0.5, -37, 65, 36.5, "Meta-training (Algorithm 1)")
+axes.text(2, -5.6, "for every task i of all tasks, in every outer step", fontsize=8, color=INK)
+box(2, -17, 13, "Batch", "windows, one\ndemonstration", DATA)
+box(20, -12.5, 13, "Support", "some windows", DATA, 6)
+box(20, -21.5, 13, "Query", "the others", DATA, 6)
+box(38, -13, 12, "Loss", r"at $\theta$", LOSS, 7)
+box(38, -22, 12, "Loss", r"at $\theta'_i$", LOSS, 7)
+box(53.5, -13, 10.5, r"$\theta'_i$", "task's own", WEIGHTS, 7)
+box(20, -35, 13, r"$\theta$", "meta-trained", WEIGHTS)
+box(2, -35, 13, r"EMA of $\theta$", "what is kept", WEIGHTS)
+arrow((15, -12), (17.5, -12), (17.5, -9.5), (20, -9.5))
+arrow((15, -14.5), (17.5, -14.5), (17.5, -18.5), (20, -18.5))
+arrow((33, -9.5), (38, -9.5))
+arrow((33, -18.5), (38, -18.5))
+arrow((50, -9.5), (53.5, -9.5))
+axes.text(
+    53, -4.6, r"inner step: $\theta - \alpha\nabla\mathcal{L}$", fontsize=8, color=INK, ha="center"
+)
+arrow((58.75, -13), (58.75, -18.5), (50, -18.5))
+arrow((44, -22), (44, -31), (33, -31))
+axes.text(
+    45,
+    -26.8,
+    "outer step: AdamW on the mean\nover tasks, differentiated\nthrough the inner step",
+    fontsize=8,
+    color=INK,
+    va="center",
+)
+arrow((26.5, -27), (26.5, -24), (35.5, -24), (35.5, -11.5), (38, -11.5), dashed=True)
+arrow((20, -31), (15, -31))
+
+# Adaptation
+panel(67, -37, 42.5, 36.5, "Adaptation to a novel task (Algorithm 2)")
+box(68.5, -17, 14, "Demonstrations", "ten; windows and\none as reference", DATA)
+box(87, -16.5, 8.5, "Loss", r"at $\theta$", LOSS, 7)
+box(99, -17, 9, r"$\theta$", "adapted", WEIGHTS)
+box(68.5, -35, 14, "Meta-trained", "EMA, copied", WEIGHTS)
+box(87, -35, 21, "Rollouts", "EMA of the adapted weights,\nnew goals", DATA)
+arrow((82.5, -13), (87, -13))
+arrow((95.5, -13), (99, -13))
+arrow(
+    (103.5, -9),
+    (103.5, -6.5),
+    (91.25, -6.5),
+    (91.25, -9.5),
+    label="200 steps of AdamW",
+    at=(97, -5),
+)
+arrow((75.5, -27), (75.5, -22), (101, -22), (101, -17), label="start", at=(80, -20.8))
+arrow((105.5, -17), (105.5, -27), label="EMA", at=(102.8, -25))
+arrow((15, -33), (17, -33), (17, -36.2), (66.2, -36.2), (66.2, -31), (68.5, -31), dashed=True)
+
+# Legend
+axes.text(2, -42, "Colors:", fontsize=9, weight="bold", color=INK, va="center")
+for i, (name, color) in enumerate(LEGEND.items()):
+    x = 10 + 16.5 * i
+    axes.add_patch(FancyBboxPatch((x, -43), 3, 2, boxstyle="square,pad=0", fc=color, ec=LINE))
+    axes.text(x + 4, -42, name, fontsize=9, color=INK, va="center")
+axes.plot([93, 96.5], [-42, -42], "--", color=LINE, linewidth=1.4)
+axes.text(97.2, -42, "copied weights", fontsize=9, color=INK, va="center")
+
+figure.savefig(Path(__file__).with_suffix(".png"), dpi=110)

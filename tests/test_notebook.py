@@ -1,5 +1,9 @@
 """The tutorial runs from top to bottom, with what ships in the repository."""
 
+import ast
+import base64
+import builtins
+import re
 from pathlib import Path
 
 import nbformat
@@ -15,13 +19,84 @@ def execute():
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
 
 
+def sections():
+    """Title -> syntax tree of each of the section's cells, the set-up first."""
+    found = {}
+    for cell in nbformat.read(TUTORIAL, as_version=4).cells:
+        if cell.cell_type == "markdown":
+            for title in re.findall("^## (.*)$", cell.source, re.M):
+                found[title] = []
+        else:
+            code = re.sub("^%.*$", "", cell.source, flags=re.M)  # IPython's own commands
+            found[title].append(ast.parse(code))
+    return found
+
+
+def names(tree):
+    """(names that are bound somewhere in a cell, names that are read)."""
+    bound, read = set(), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            (bound if isinstance(node.ctx, ast.Store) else read).add(node.id)
+        elif isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            bound.add(node.name)
+        elif isinstance(node, ast.arg):
+            bound.add(node.arg)
+        elif isinstance(node, ast.alias):
+            bound.add(node.asname or node.name)
+    return bound, read
+
+
+def pictures(notebook):
+    """Width in pixels of each PNG among the outputs."""
+    outputs = (output for cell in notebook.cells for output in cell.get("outputs", []))
+    held = [output.get("data", {}).get("image/png") for output in outputs]
+    return [int.from_bytes(base64.b64decode(png)[16:20], "big") for png in held if png]
+
+
 def test_the_tutorials_outputs_are_committed_as_it_ran():
     notebook = nbformat.read(TUTORIAL, as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert len(notebook.cells) <= 45 and TUTORIAL.stat().st_size < 5e6
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
-    assert sum("image/png" in str(cell.outputs) for cell in code) >= 13
+    widths = pictures(notebook)
+    assert len(widths) >= 18 and min(widths) >= 800  # pixels: 7 inches at 120 dpi
     assert not any(output.output_type == "error" for cell in code for output in cell.outputs)
+    kinds = [kind for cell in code for output in cell.outputs for kind in output.get("data", {})]
+    assert kinds.count("image/gif") == 1  # the rollout
+    assert any("animation" in str(cell.outputs) for cell in code)  # the cloud to be turned
+
+
+def test_a_section_of_the_tutorial_needs_the_set_up_and_nothing_else():
+    setup, *others = sections().values()
+    known = set(dir(builtins)).union(*(names(tree)[0] for tree in setup))
+    for cells in others:
+        here = set(known)
+        for tree in cells:
+            bound, read = names(tree)
+            here |= bound
+            assert read <= here, read - here
+
+
+def test_a_task_is_named_in_one_cell_of_the_tutorial():
+    from simulator import INSTRUCTIONS  # not above: as a script, this file sees no modules
+
+    setup, *others = sections().values()
+    for tree in [*setup[1:], *(tree for cells in others for tree in cells)]:
+        strings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+        assert not strings & set(INSTRUCTIONS)
+
+
+def test_the_tutorial_asserts_what_it_claims():
+    checked = " ".join(
+        ast.unparse(node)
+        for cells in sections().values()
+        for tree in cells
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assert)
+    )
+    for claim in ("losses['MAML', 1]", "off['second']", "by_hand", "own demonstration alone"):
+        assert claim in checked, claim
 
 
 def test_the_tutorial_runs(pytestconfig):
