@@ -300,7 +300,7 @@ class WindowSampler:
         known = (config.state_dim, config.action_dim, config.num_points)
         if found[:2] != known[:2] or N < config.num_points:
             what = f"state, action, points have {found} dimensions, the policy's have {known}"
-            raise ValueError(f"{self.task}: {what}: use a checkpoint trained on such data")
+            raise ValueError(f"{self.task}: {what}: use recordings, and a checkpoint, that agree")
         T = max(math.ceil((e.stop - e.start) / config.demo_stride) for e in self.episodes)
         if config.demo_encoder != "none" and T > config.demo_positions:
             what = f"a demonstration has {T} frames (every {config.demo_stride}th)"

@@ -134,7 +134,8 @@ def adapt_checkpoint(
     rates = {p: lr * scale if given[p] is None else given[p] for p, lr in LEARNING_RATES.items()}
     batch = settings.batch or BATCH[info["preset"]]
     used = asdict(settings) | {"batch": batch, "learning_rates": rates}
-    scripts.print_settings(used, asdict(Settings()))
+    resolved = used | {f"lr_{part}": rate for part, rate in rates.items()}
+    scripts.print_settings(resolved, asdict(Settings()))
     about = {name: info[name] for name in evaluate.TRAINED} | {"adaptation": used}
     about |= {"adapted_to": task, "instruction": demonstrations.instruction}
 

@@ -118,10 +118,15 @@ def format_table(rows: Sequence[Sequence[Any]]) -> str:
 
 def print_settings(used: dict[str, Any], default: dict[str, Any]) -> None:
     """A table of what a run is made of, and of what that would be by default."""
-    rows = [
-        [name, value, "" if default.get(name, value) == value else default[name]]
-        for name, value in used.items()
-    ]
+
+    def text(value: Any) -> str:
+        return f"{value:g}" if isinstance(value, float) else str(value)
+
+    rows = []
+    for name, value in used.items():
+        if not isinstance(value, dict):
+            usual = default.get(name, value)
+            rows.append([name, text(value), "" if usual in (value, None) else text(usual)])
     print_once(format_table([["setting", "value", "default"], *rows]))
 
 

@@ -432,7 +432,7 @@ def test_a_policy_that_fits_its_demonstrations_has_a_small_action_error():
     policy.normalizer.fit(shown.points, shown.state, shown.action)
     before, plain = evaluate.action_error(policy, shown, unseen, torch.zeros(512))
     adapting = finetune.adapt_policy(
-        policy, shown, torch.zeros(512), 150, 32, dict.fromkeys(finetune.LEARNING_RATES, 3e-3)
+        policy, shown, torch.zeros(512), 80, 16, dict.fromkeys(finetune.LEARNING_RATES, 5e-3)
     )
     *_, (_, _, adapted) = adapting
     after, _ = evaluate.action_error(adapted, shown, unseen, torch.zeros(512))
