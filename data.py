@@ -200,40 +200,6 @@ def draw_affine_maps(n: int, middle: Tensor, generator: torch.Generator) -> tupl
     return a, b
 
 
-def backwards(recorded: Demonstrations, rest: int = 20) -> Demonstrations | None:
-    """Plays every episode from `rest` frames after its success back to its first frame.
-
-    That is another task in the same scenes, and as far as nothing falls a possible one: a drawer
-    closes where it opened. An action leads to the frame that is played next: its displacement is
-    the hand's, in units of an action (as the fastest frames are to the largest actions), its
-    gripper what was asked for there. What is left of an episode rests in its last frame. Returns
-    None for a recording that does not tell its successes and where the hand is in its state.
-    """
-    if not all(recorded.meta.get(key) for key in ("success_frames", "positions_in_state")):
-        return None
-    ends, frames, lengths = recorded.episode_ends, [], []
-    for index, success in zip(range(len(recorded)), recorded.meta["success_frames"]):
-        whole = recorded.episode(index)
-        played = np.arange(min(whole.start + success + rest, whole.stop - 1), whole.start - 1, -1)
-        frames.append(np.pad(played, (0, whole.stop - whole.start - len(played)), mode="edge"))
-        lengths.append(len(played))
-    frame = np.concatenate(frames)  # (F,)
-    following = np.roll(frame, -1)
-    following[ends - 1] = frame[ends - 1]
-
-    hand, actions = recorded.state[:, :3], recorded.action
-    moved = hand[following] - hand[frame]  # (F, 3)
-    fast, full = (np.quantile(np.abs(x).max(axis=1), 0.95) for x in (moved, actions[:, :3]))
-    displacement = (moved * (full / max(fast, 1e-6))).clip(-1, 1).astype(np.float32)
-    return replace(
-        recorded,
-        points=recorded.points[frame],
-        state=recorded.state[frame],
-        action=np.concatenate([displacement, actions[following, 3:]], axis=1),
-        meta=recorded.meta | {"success_frames": [max(n - 1 - rest, 0) for n in lengths]},
-    )
-
-
 # ---- Windows -------------------------------------------------------------------------------------
 
 

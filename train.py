@@ -31,7 +31,7 @@ from torch.optim.swa_utils import AveragedModel
 import baselines
 import evaluate
 import scripts
-from data import WindowSampler, backwards, load_demonstrations
+from data import WindowSampler, load_demonstrations
 from maml import meta_gradient
 from model import PRESETS, DAMIPolicy, PolicyConfig, ema_model
 from scripts import Flags, choose, command_line, progress_bar, save_checkpoint, setting
@@ -62,7 +62,6 @@ class Settings(Flags):
     after_success: int | None = setting(None, "windows begin at most so much later", least=0)
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
     instruction_dropout: float = setting(0.0, "share of batches without it", least=0, most=1)
-    backwards: float = setting(0.0, "share of batches played backwards", least=0, most=1)
     support_only: float = setting(0.0, "share of inner steps told nothing else", least=0, most=1)
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
     held_out: int = setting(0, "of them, the last so many only judge", least=0)
@@ -104,29 +103,25 @@ def task_batch(
     n: int,
     seed: tuple[int, ...],
     settings: Settings,
-    undone: WindowSampler | None = None,
     inner: bool = False,
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
     Where the instruction names the task, nothing else need be read. In a share of the batches it
-    is therefore left out (zeros). Another share comes from `undone`, the same episodes played
-    backwards, without it, too: a task that only the demonstration tells. And where an `inner` step
-    follows, a share has neither (zeros): then the support windows alone tell the task.
+    is therefore left out (zeros), and only the demonstration tells the task. Where an `inner` step
+    follows, a share sees neither: there the support windows alone tell it.
 
     Returns the keyword arguments of `policy.loss`. They follow from `seed` alone.
     """
     for_batch, for_shares = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     generator = torch.Generator().manual_seed(int(for_batch))
-    drop, turn, hide = torch.rand(3, generator=torch.Generator().manual_seed(int(for_shares)))
-    if undone is not None and turn < settings.backwards:
-        sampler, text = undone, torch.zeros_like(text)
-    elif drop < settings.instruction_dropout:
-        text = torch.zeros_like(text)
+    drop, hide = torch.rand(2, generator=torch.Generator().manual_seed(int(for_shares)))
+    hide = inner and hide < settings.support_only
     windows = sampler.batch(n, generator)
-    if inner and hide < settings.support_only:
+    if hide:
         shown = [name for name in windows if name not in PER_WINDOW]
         windows |= {name: torch.zeros_like(windows[name]) for name in shown}
+    if hide or drop < settings.instruction_dropout:
         text = torch.zeros_like(text)
     return {"text": text[None], **windows, **policy.draw_noise_and_timesteps(n, generator)}
 
@@ -185,7 +180,6 @@ def meta_train(
     samplers: dict[str, WindowSampler],
     text: dict[str, Tensor],
     settings: Settings,
-    undone: dict[str, WindowSampler] | None = None,
     start: int = 0,
     rank: int = 0,
     world: int = 1,
@@ -194,7 +188,6 @@ def meta_train(
 
     Args:
         samplers, text: task -> its windows, and its instruction feature (text_dim,).
-        undone: task -> windows of the same episodes played backwards, where that can be.
         rank, world: this process's number, and how many share the tasks.
 
     Yields:
@@ -206,7 +199,7 @@ def meta_train(
     """
     params = dict(policy.named_parameters())
     my_tasks = list(enumerate(samplers))[rank::world]
-    seed, n, undone = settings.seed, settings.support + settings.query, undone or {}
+    seed, n = settings.seed, settings.support + settings.query
     multi_task_share = 1.0 if settings.maml == "off" else settings.multi_task_share
     multi_task_steps = round(multi_task_share * settings.steps)
 
@@ -222,9 +215,7 @@ def meta_train(
         # A generator: the inner loop below keeps the batches of `at_once` tasks in memory, not all.
         inner = step >= multi_task_steps
         batches = (  # lines 3 to 6, 9
-            task_batch(
-                policy, samplers[t], text[t], n, (seed, step, i), settings, undone.get(t), inner
-            )
+            task_batch(policy, samplers[t], text[t], n, (seed, step, i), settings, inner)
             for i, t in my_tasks
         )
 
@@ -282,7 +273,7 @@ def main(argv: list[str] | None = None) -> None:
     suite = "own" if own else choose(args.suite or "ml10", SUITES, "suite")
     settings, policy = SETTINGS[preset], args.policy or "dami"
     if policy != "dami" or args.demo_encoder == "none":  # the instruction alone tells the task
-        settings = replace(settings, instruction_dropout=0.0, backwards=0.0, support_only=0.0)
+        settings = replace(settings, instruction_dropout=0.0, support_only=0.0)
     settings = settings.given(args, suite=suite)
     name = preset if policy == "dami" else f"{policy}-{preset}"
     if own:  # all demonstrations unless told otherwise, and no simulator to be rolled out in
@@ -329,10 +320,9 @@ def run(
     config = scripts.choose_config(args, settings.preset, recorded, settings.suite == "own")
 
     recorded, held = evaluate.hold_out(recorded, settings.held_out)
-    back = {t: backwards(d, rest or 0) for t, d in recorded.items()} if settings.backwards else {}
     how = (config, device, rest, settings.augment)
     shown = n and n - settings.held_out  # demonstrations for rollouts
-    samplers, unseen, undone = (scripts.windows(part, *how) for part in (recorded, held, back))
+    samplers, unseen = (scripts.windows(part, *how) for part in (recorded, held))
     policy, ema, optimizer = initialize(config, settings, samplers, device)
     data = scripts.digest(samplers)
     left = {"step": 0, "seconds": 0.0, "text_weights": None}
@@ -355,9 +345,7 @@ def run(
         if leader:
             evaluate.evaluate_step(folder, start, *how)  # the run may have been stopped meanwhile
         began = saved = time.monotonic()
-        training = meta_train(
-            policy, ema, optimizer, samplers, text, settings, undone, start, rank, world
-        )
+        training = meta_train(policy, ema, optimizer, samplers, text, settings, start, rank, world)
         for step, figures in training:
             seconds += time.monotonic() - began
             if leader:

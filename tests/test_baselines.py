@@ -403,7 +403,7 @@ def test_a_policy_is_trained_resumed_adapted_and_rolled_out(
     assert all(math.isfinite(x["loss"]) and x["loss"] != x["loss_before"] for x in losses)
     _, info = weights("run/last.pt")
     arguments = info["arguments"]
-    assert arguments["instruction_dropout"] == arguments["backwards"] == 0
+    assert arguments["instruction_dropout"] == arguments["support_only"] == 0
     train.main([*argv, "--out", "run", "--resume"])
 
     adapt = ["--task", "door-close", "--checkpoint", "run", "--data", str(recorded), "--out", "new"]

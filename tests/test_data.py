@@ -447,31 +447,3 @@ def test_interrupting_ends_with_exit_code_130(capsys):
 
 
 # ---- Backwards -----------------------------------------------------------------------------------
-
-
-def test_backwards_the_actions_undo_what_the_episode_did():
-    """A hand that each action moves by a centimetre times the action."""
-    demonstrations = recording((60, 40))
-    action = demonstrations.action
-    state = demonstrations.state.copy()
-    for episode in (slice(0, 60), slice(60, 100)):
-        state[episode, :3] = 0.01 * np.cumsum(action[episode, :3], axis=0)
-        state[episode, :3] -= 0.01 * action[episode, :3]  # a frame is seen before its action
-    meta = {"positions_in_state": 3, "success_frames": [25, 39]}
-    there = replace(demonstrations, state=state, meta=meta)
-    assert data.backwards(demonstrations) is None  # which tells neither
-    back = data.backwards(there, rest=10)
-    assert back.problem() is None
-    assert back.episode_ends.tolist() == there.episode_ends.tolist()
-    assert back.meta["success_frames"] == [25, 29]
-
-    for start, last, stop in ((0, 35, 60), (60, 99, 100)):  # the last frame that is played
-        played = slice(start, start + last - start + 1)
-        np.testing.assert_array_equal(back.points[played], there.points[start : last + 1][::-1])
-        assert (back.state[played.stop : stop] == there.state[start]).all()  # rests where it began
-        assert (back.action[played.stop - 1 : stop, :3] == 0).all()
-        moved = np.diff(back.state[played, :3], axis=0)
-        expected = 0.01 * back.action[played][:-1, :3]
-        np.testing.assert_allclose(moved, expected, atol=2e-3, rtol=0.15)
-        asked = there.action[start:last, 3][::-1]
-        np.testing.assert_array_equal(back.action[played][:-1, 3], asked)
