@@ -592,22 +592,23 @@ def build_policy(config: PolicyConfig) -> DAMIPolicy:
 
 
 SHORT = {"horizon": 4, "n_action_steps": 3}
+FLOW, FREQ = SHORT | {"sampler": "ddim"}, {"sampler": "ddim"}  # theirs: there is no choice
 # What each changes against DAMI's preset of the same name. `paper`: as the published code is run;
 # `small`: about 3 million parameters, as many as DAMI's.
 # fmt: off
 CHANGES = {
     "dami": {"paper": {}, "small": {}, "tiny": {}},
     "dp3": {"paper": {}, "small": {"unet_widths": (48, 96, 192)}, "tiny": {}},
-    "flow": {"paper": SHORT, "small": SHORT | {"unet_widths": (48, 96, 192)}, "tiny": SHORT},
+    "flow": {"paper": FLOW, "small": FLOW | {"unet_widths": (48, 96, 192)}, "tiny": FLOW},
     "mamba": {
         "paper": SHORT | {"unet_widths": (128, 256, 512)},
         "small": SHORT | {"unet_widths": (32, 64, 112)},
         "tiny": SHORT,
     },
     "freq": {
-        "paper": {"unet_widths": (512, 1024)},
-        "small": {"unet_widths": (128, 256)},
-        "tiny": {"unet_widths": (32, 64)},
+        "paper": FREQ | {"unet_widths": (512, 1024)},
+        "small": FREQ | {"unet_widths": (128, 256)},
+        "tiny": FREQ | {"unet_widths": (32, 64)},
     },
 }
 # fmt: on

@@ -71,7 +71,7 @@ class PolicyConfig:
     n_groups: int = 8
     diffusion_steps: int = 100  # K
     inference_steps: int = 10
-    sampler: str = "ddim"  # ddim | dp3, see DiffusionSchedule.step
+    sampler: str = "dp3"  # ddim | dp3, see DiffusionSchedule.step
 
     def __post_init__(self):
         # A checkpoint brings lists back where tuples went in.
@@ -442,7 +442,8 @@ class DiffusionSchedule(nn.Module):
         """One DDIM step from k to k - K / inference_steps, (B, H, A) -> (B, H, A).
 
         The noise that is put back leads from the prediction, not clipped, to `noisy`. DP3 pins
-        diffusers 0.11.1, which puts back the predicted sample itself (sampler `dp3`).
+        diffusers 0.11.1, which puts back the predicted sample itself (sampler `dp3`): every step
+        then asks again from a guess without noise, and more rollouts succeed.
         """
         stride = self.diffusion_steps // self.inference_steps
         a = self.alphas_cumprod[k]

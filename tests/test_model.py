@@ -195,7 +195,7 @@ def test_sampling_equals_a_full_run_of_diffusers(peer):
 
 
 def test_sampled_actions_are_diffusers_run_of_the_denoiser_from_the_newest_observation_on(peer):
-    policy = new_policy()
+    policy = new_policy(sampler="ddim")
     batch = random_batch(policy.config)
     policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
     context = context_of(policy, batch)
