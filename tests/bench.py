@@ -345,6 +345,7 @@ def main(argv: list[str] | None = None) -> None:
     )
     parser.add_argument("--inner-step", action="store_true", help="only what it does to a policy")
     parser.add_argument("--data", default="data", help="demonstrations that --inner-step reads")
+    parser.add_argument("--inner-lr", type=float, help="its rate (default: of the training)")
     parser.add_argument(
         "--checkpoint", default=SHIPPED_CHECKPOINT, help="its policy, or run folder"
     )
