@@ -237,7 +237,7 @@ def inner_step_table(checkpoint: Path, folder: str, rate: float | None, seeds: i
         return ((new - old).norm() / old.norm()).item()
 
     def pairs_of(seed: int, split_: str, **shares: float) -> list[tuple[dict, dict]]:
-        how = Settings(**shares), None, True
+        how = Settings(**shares), True
         of_tasks = slice(len(base)) if split_ == "base" else slice(len(base), None)
         batches = [
             task_batch(policy, sampler, feature, n, (seed, 0, index), *how)
