@@ -42,7 +42,7 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
     "ml10-scratch": "from random weights",
-    "before": "before: the instruction always told, inner rate 1e-4",
+    "before": "before: the instruction always told, inner rate 1e-4, DDIM",
     "before-no-inner-loop": "before, without the inner loop",
 }
 
