@@ -288,7 +288,8 @@ def main(words: list[str]) -> None:
         write_atomically(ROOT / name, lambda path, filled=filled: path.write_text(filled))
     draw_swap(results, ROOT / "assets" / "swap.png")
     draw_by_task(results, ROOT / "assets" / "success.png")
-    draw_adaptation(results, ROOT / "assets" / "adaptation.png")
+    if any("curve" in run for run in results.values()):
+        draw_adaptation(results, ROOT / "assets" / "adaptation.png")
 
 
 if __name__ == "__main__":
