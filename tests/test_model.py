@@ -219,7 +219,7 @@ def test_the_timestep_embedding_equals_that_of_diffusers():
 
 
 def test_sampling_is_repeatable_from_a_seed_and_shaped_as_an_action_chunk():
-    policy = new_policy()
+    policy = new_policy(sampler="ddim")  # DP3's keeps little of the noise
     batch = random_batch(policy.config, windows=5)
     first, again, other = (
         sample(policy, batch),
