@@ -1,7 +1,7 @@
 """Meta-training (Algorithm 1): second-order MAML over all tasks of a suite.
 
     python train.py --suite ml10                        # collects demonstrations, trains, evaluates
-    python train.py --suite ml10 --preset tiny          # the same in two minutes, to see it work
+    python train.py --suite ml10 --preset tiny          # the same in a minute, to see it work
     python train.py --suite ml10 --resume               # goes on where an interrupted run stopped
     python train.py --suite ml10 --policy dp3 --maml off    # multi-task DP3; see baselines.py
     python train.py --data recordings                   # own tasks: every recording in a folder
