@@ -254,9 +254,9 @@ def choose_config(
     return config
 
 
-def windows(recorded: dict[str, Demonstrations | None], *how: Any) -> dict[str, WindowSampler]:
-    """The windows of each task that there is a recording of; `how` as WindowSampler takes it."""
-    return {task: WindowSampler(d, *how) for task, d in recorded.items() if d is not None}
+def windows(recorded: dict[str, Demonstrations], *how: Any) -> dict[str, WindowSampler]:
+    """The windows of each task's recording; `how` as WindowSampler takes it."""
+    return {task: WindowSampler(d, *how) for task, d in recorded.items()}
 
 
 def instruction_features(

@@ -27,7 +27,7 @@ from evaluate import (
     mean_success,
     wilson_interval,
 )
-from scripts import load_checkpoint, save_checkpoint
+from scripts import format_table, load_checkpoint, save_checkpoint
 from simulator import suite_tasks
 from tests.runs import REPORTS
 
@@ -95,14 +95,6 @@ def mean(results: dict, variant: str, report: str, column: int | str = 0) -> str
     return f"{format_success(sum(episodes), len(episodes))} (one run)"
 
 
-def row(*cells: object) -> str:
-    return f"| {' | '.join(str(cell) for cell in cells)} |"
-
-
-def table(head: list[str], rows: list[list[object]]) -> str:
-    return "\n".join([row(*head), "|---" * len(head) + "|", *(row(*cells) for cells in rows)])
-
-
 def means_table(results: dict) -> str:
     """The means of DAMI, with and without the instruction, of multi-task training, the paper's."""
     shown = {
@@ -119,7 +111,7 @@ def means_table(results: dict) -> str:
         ours = [mean(results, "ml10-dami", *report) for report in (told, alone)]
         rows.append([title, *ours, mean(results, "ml10-neither", *told), *theirs])
     head = ["ML10", "DAMI", "DAMI, not told", "multi-task", "paper, DP3", "paper, DAMI"]
-    return table(head, rows)
+    return format_table([head, *rows])
 
 
 def by_task_table(split: str) -> Callable[[dict], str]:
@@ -142,7 +134,7 @@ def by_task_table(split: str) -> Callable[[dict], str]:
         means = [mean(results, "ml10-dami", *column) for column in columns.values()]
         theirs = [np.mean([PAPER[split][t][n] for t in TASKS[split]]) for n in ("DP3", "DAMI")]
         rows.append(["**mean**", *means, *(f"{value:.1f}" for value in theirs)])
-        return table(["task", *columns, "paper, DP3", "paper, DAMI"], rows)
+        return format_table([["task", *columns, "paper, DP3", "paper, DAMI"], *rows])
 
     return make
 
@@ -154,7 +146,8 @@ def variants_table(results: dict) -> str:
         columns = ("base", 0), ("novel", "before"), ("novel", "after")
         if runs_of(results, variant):
             rows.append([title, *(mean(results, variant, *column) for column in columns)])
-    return table(["ML10", "base", "novel, no gradient step", "novel, 200 steps"], rows)
+    head = ["ML10", "base", "novel, no gradient step", "novel, 200 steps"]
+    return format_table([head, *rows])
 
 
 def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
@@ -181,7 +174,7 @@ def swap_table(results: dict) -> str:
             episodes = [s for task in successes.values() for s in task]
             rows.setdefault(label, {})[title] = format_success(sum(episodes), len(episodes))
     cells = [[label, *(by.get(title, "") for title in policies)] for label, by in rows.items()]
-    return table(["what the policy sees", *policies], cells)
+    return format_table([["what the policy sees", *policies], *cells])
 
 
 TABLES = {

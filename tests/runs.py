@@ -24,11 +24,11 @@ from scripts import choose, command_line
 VARIANTS = {
     "dami": "",
     "no-inner-loop": "--maml off",
-    "no-demonstration": "--demo-encoder none",
+    "no-demonstration": "--demo-encoder none --inner-lr 3e-3",
     "neither": "--demo-encoder none --maml off",
     "first-order": "--maml first",
     "no-dropout": "--instruction-dropout 0",
-    "half-dropout": "--instruction-dropout 0.5",
+    "less-dropout": "--instruction-dropout 0.2",
     "no-support-only": "--support-only 0",
     "mlp": "--demo-encoder mlp",
     "mid": "--tcfm mid",

@@ -425,6 +425,19 @@ def test_a_run_of_an_older_version_which_lacks_a_setting_is_resumed(run, recorde
         train.main([*argv, "--resume", "--held-out", "1"])
 
 
+def test_what_concerns_the_inner_step_may_differ_before_the_first_one(run, recorded, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    argv = [*FEW, "--data", str(recorded), "--out", str(tmp_path / "run"), "--resume"]
+    argv += "--episodes 2 --evaluate-every 6".split()
+    other = "--inner-lr 0.5 --support-only 0.5".split()
+    with pytest.raises(ValueError, match=r"inner_lr .* -> 0.5, support_only 0.0 -> 0.5"):
+        train.main([*argv, *other])
+    last = torch.load(run / "last.pt", weights_only=True)
+    last["arguments"]["multi_task_share"] = 1.0
+    torch.save(last, tmp_path / "run" / "last.pt")
+    train.main([*argv, *other, "--multi-task-share", "1"])
+
+
 # ---- Bad input -----------------------------------------------------------------------------------
 
 
