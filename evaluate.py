@@ -154,7 +154,7 @@ def rollout(
     sampler: WindowSampler,
     text: Tensor,
     generator: torch.Generator,
-    on_chunk: Callable[[int, dict], None] | None = None,
+    on_chunk: Callable[[], None] | None = None,
     blank: bool = False,
 ) -> list[bool]:
     """Rolls out E episodes of one task side by side, and says which of them succeeded.
@@ -168,7 +168,7 @@ def rollout(
         sampler: of the task's demonstrations, from which one a rollout is drawn.
         text: instruction feature, (text_dim,).
         generator: draws demonstrations and noise; on the CPU.
-        on_chunk: called with (index of the environment, observation) before each chunk.
+        on_chunk: called before each round of chunks.
         blank: the policy sees zeros in place of its demonstration.
 
     Returns:
@@ -190,8 +190,7 @@ def rollout(
         points = np.stack([[f["point_cloud"] for f in frames[e]] for e in running])  # (E, To, N, 3)
         state = np.stack([[f["agent_pos"] for f in frames[e]] for e in running])  # (E, To, S)
         if on_chunk is not None:
-            for e in running:
-                on_chunk(e, frames[e][-1])
+            on_chunk()
 
         chunks = sample_chunks(
             policy,
@@ -354,7 +353,7 @@ def rollout_job(
     while len(loaded["envs"]) < len(seeds):
         loaded["envs"].append(MetaWorldPointCloudEnv(task, policy.config.num_points))
 
-    def on_chunk(*_: Any) -> None:
+    def on_chunk() -> None:
         if worker.stop.is_set():  # Ctrl-C in the starting process
             raise InterruptedError("evaluation was interrupted")
 
@@ -589,11 +588,13 @@ def draw_curves(folder: Path) -> None:
 
 # ---- Animations ----------------------------------------------------------------------------------
 
+FPS = 30
+
 
 def write_gif(
     policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, seed: int, path: str | Path
 ) -> bool:
-    """Rolls out one episode and animates it: the ray-cast picture beside the cloud the policy sees.
+    """Rolls out one episode and animates every second step: the picture, and what the policy sees.
 
     Returns whether the episode succeeded.
     """
@@ -602,17 +603,20 @@ def write_gif(
 
     writer = movie_writer(path)
     env = MetaWorldPointCloudEnv(sampler.task, policy.config.num_points, render_mode="rgb_array")
-    frames = []
+    frames, advance = [], env.advance
 
-    def on_chunk(_: int, observation: dict) -> None:
-        frames.append((env.render(), observation["point_cloud"]))
+    def film(action: np.ndarray) -> tuple:
+        if env.steps % 2 == 0:
+            frames.append((env.render(), env.cloud()))
         progress.update()
+        return advance(action)
 
+    env.advance = film
     goal = evaluation_seed(seed, 0)
     generator = torch.Generator().manual_seed(goal)
-    with scripts.progress_bar(desc="rolling out", unit="chunk") as progress:
-        (success,) = rollout(policy, [env], [goal], sampler, text, generator, on_chunk)
-        on_chunk(0, env.observe())  # how it ended
+    with scripts.progress_bar(desc="rolling out", unit="step") as progress:
+        (success,) = rollout(policy, [env], [goal], sampler, text, generator)
+    frames.append((env.render(), env.cloud()))  # how it ended
 
     clouds = np.concatenate([cloud for _, cloud in frames])
     low, high = clouds.min(0), clouds.max(0)
@@ -627,15 +631,15 @@ def write_gif(
         left.imshow(picture)
         left.set_axis_off()
         left.set_title(f"{sampler.task}: {'success' if success else 'failure'}", fontsize=9)
-        right.scatter(*cloud.T, c=cloud[:, 2], cmap="viridis", vmin=low[2], vmax=high[2], s=4)
+        right.scatter(*cloud.T, c=cloud[:, 2], cmap="viridis", vmin=low[2], vmax=high[2], s=9)
         right.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         right.set(xticklabels=[], yticklabels=[], zticklabels=[])
         right.set_box_aspect(high - low)
         right.view_init(elev=25, azim=-30)
-        step = min(index * policy.config.n_action_steps, env.steps)
+        step = min(2 * index, env.steps)
         right.set_title(f"{policy.config.num_points} points, step {step}", fontsize=9)
 
-    shown = [*range(len(frames)), len(frames) - 1, len(frames) - 1]  # the end stays a while
+    shown = [*range(len(frames)), *[len(frames) - 1] * 10]  # the end stays a while
     animation = FuncAnimation(figure, draw, frames=shown)
     with scripts.progress_bar(desc="drawing", unit="frame", total=len(shown)) as progress:
         how = {"writer": writer, "dpi": 70, "progress_callback": lambda *_: progress.update()}
@@ -655,13 +659,13 @@ def movie_writer(path: str | Path) -> Any:
     if not path.resolve().parent.is_dir():
         problem = "there is no such folder"
     elif path.suffix == ".gif":
-        return PillowWriter(fps=8)
+        return PillowWriter(fps=FPS)
     elif path.suffix == ".mp4":
         with suppress(ImportError):
             ffmpeg = import_module("imageio_ffmpeg").get_ffmpeg_exe()
             matplotlib.rcParams["animation.ffmpeg_path"] = ffmpeg
         if FFMpegWriter.isAvailable():
-            return FFMpegWriter(fps=8)
+            return FFMpegWriter(fps=FPS)
         problem = "install ffmpeg or `pip install imageio-ffmpeg`, or name it .gif"
     raise ValueError(f"cannot write {path}: {problem}")
 

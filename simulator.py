@@ -28,6 +28,7 @@ import mujoco
 import numpy as np
 from metaworld import env_dict
 from metaworld.policies import ENV_POLICY_MAP
+from scipy.ndimage import binary_dilation
 
 from data import Demonstrations, farthest_point_sample, load_demonstrations, save_demonstrations
 from scripts import at_least, choose, command_line, remove_temporaries, run_jobs, worker
@@ -115,10 +116,16 @@ def check_task(task: str) -> str:
 
 def is_simulated(recorded: Demonstrations, path: str | Path) -> bool:
     """Whether a recording is of a task of Meta-World; ValueError if it only has such a name."""
-    if recorded.task in INSTRUCTIONS and recorded.meta | RECIPE != recorded.meta:
-        what = f"{path} is not Meta-World's {recorded.task} as recorded here"
-        raise ValueError(f"{what}: give your task, and its file, a name of their own")
+    if recorded.task in INSTRUCTIONS and (other := made_otherwise(recorded, RECIPE)):
+        what = f"{path} is not Meta-World's {recorded.task} as recorded here (another {other})"
+        raise ValueError(f"{what}: record it again, or give your task, and its file, another name")
     return recorded.task in INSTRUCTIONS
+
+
+def made_otherwise(recorded: Demonstrations, recipe: dict) -> str:
+    """What of a recipe is not as it says, in words; an empty string if all is."""
+    found = recorded.meta | {"task": recorded.task}
+    return ", ".join(name for name in recipe if found.get(name) != recipe[name])
 
 
 def own_recordings(folder: str | Path) -> dict[str, Path]:
@@ -161,6 +168,7 @@ def evaluation_seed(seed: int, episode: int) -> int:
 VISIBLE = np.array([True, True, True, False, False, False])  # which groups MuJoCo's renderer shows
 HIDDEN_GROUP = 5
 FAR = 1e3  # metres
+FEW_RAYS = 32  # what fewer meet is looked at more closely
 
 SKY = (0.75, 0.85, 0.95)
 LIGHT = (0.4, -0.5, 0.77)  # direction towards the light, unit length within 1 %
@@ -185,6 +193,28 @@ def geom_colors(model: mujoco.MjModel) -> np.ndarray:
     return colors
 
 
+def meet_ellipsoid(
+    origin: np.ndarray, rays: np.ndarray, center: np.ndarray, axes: np.ndarray, half: np.ndarray
+) -> np.ndarray:
+    """Where rays (R, 3) from `origin` meet an ellipsoid from outside: (R,) metres, or inf.
+
+    Its axes are columns (3, 3), half as long as `half` (3,) says, metres.
+    """
+    distance = np.full(len(rays), np.inf)
+    along, reach = rays @ (center - origin), half.max()
+    away = (center - origin) @ (center - origin)
+    near = np.flatnonzero((along > 0) & (along**2 >= away - reach**2))  # meet the ball around it
+
+    # In its own frame and stretched it is the unit ball: |start + t * step| = 1.
+    start, step = (origin - center) @ axes / half, rays[near] @ axes / half  # (3,), (near, 3)
+    a, b, c = (step**2).sum(axis=1), step @ start, start @ start - 1
+    under_root = b**2 - a * c
+    with np.errstate(invalid="ignore"):
+        t = (-b - np.sqrt(under_root)) / a  # the first of its two solutions
+    distance[near] = np.where(t >= 0, t, np.inf)  # NaN: it passes by; below 0: from inside
+    return distance
+
+
 class RayCastCamera:
     """A fixed pinhole camera that casts rays at a MuJoCo model's visible geoms and sphere sites.
 
@@ -198,6 +228,11 @@ class RayCastCamera:
         box: ((x, y, z) low, (x, y, z) high) of the workspace, world frame, metres.
         camera: the name of a camera of the model that is attached to the world.
         position: where it is moved, world frame, metres; None leaves it where it is.
+        arm: names of bodies whose exact shape does not matter, as it takes most of the time: in
+            clouds, though not in `depth` and `render`, each geom is the ellipsoid in its box.
+
+    Raises:
+        ValueError: the camera moves with a body, or does not see the workspace.
     """
 
     def __init__(
@@ -207,6 +242,7 @@ class RayCastCamera:
         box: tuple[Sequence[float], Sequence[float]],
         camera: str,
         position: Sequence[float] | None = None,
+        arm: Sequence[str] = (),
     ):
         self.model = model
         self.pixels = pixels
@@ -235,20 +271,34 @@ class RayCastCamera:
         )
 
         # What of it becomes points: all but floor, table and walls.
-        self.scenery = self.find_scenery()  # (geoms,) bool
+        self.scenery, self.top = self.find_scenery()  # (geoms,) bool, and its height
+        of_arm = np.isin(model.geom_bodyid, [model.body(name).id for name in arm])
+        self.arm = np.flatnonzero(of_arm & VISIBLE[model.geom_group])
+        self.things = ~self.scenery & ~of_arm
+        self.still = self.things & (model.body_weldid[model.geom_bodyid] == 0)  # in an episode
+        self.still_at, self.met_still = None, None
 
-        # The rays that meet the workspace: they enter each slab of it before they leave any.
+        # The rays that meet the workspace: they enter each slab of it before they leave any. And
+        # four for each pixel.
         rays = self.rays(pixels)  # (pixels**2, 3)
         with np.errstate(divide="ignore"):
             first, second = (self.low - self.origin) / rays, (self.high - self.origin) / rays
         enter = np.minimum(first, second).max(axis=1)  # (pixels**2,) metres
         leave = np.maximum(first, second).min(axis=1)
         meets = leave > np.maximum(enter, 0)
+        if not meets.any():
+            raise ValueError(f"camera {camera!r} does not see the workspace: move one of them")
+        self.in_workspace = meets.reshape(pixels, pixels)
         self.workspace_rays = rays[meets]  # (R, 3)
-        self.cutoff = leave[meets].max() if meets.any() else 0.0
+        self.cutoff = leave[meets].max()
+        fine = self.rays(2 * pixels).reshape(pixels, 2, pixels, 2, 3)
+        self.fine_rays = fine.swapaxes(1, 2).reshape(pixels, pixels, 4, 3)
 
-    def find_scenery(self) -> np.ndarray:
-        """Returns (geoms,) bool: of a body that never moves and is as wide as the workspace."""
+    def find_scenery(self) -> tuple[np.ndarray, float]:
+        """Returns (geoms,) bool: of a body that never moves and is as wide as the workspace.
+
+        And how high they reach, world frame, metres.
+        """
         model = self.model
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
@@ -257,7 +307,8 @@ class RayCastCamera:
         rotation = data.geom_xmat.reshape(-1, 3, 3)
         boxes = model.geom_aabb[..., None].copy()
         middle, half = boxes[:, :3], boxes[:, 3:]  # (geoms, 3, 1) each
-        half[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = FAR  # planes are endless
+        endless = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        middle[endless], half[endless, :, 0] = 0, (FAR, FAR, 0)
         middle, half = (rotation @ middle)[..., 0], (np.abs(rotation) @ half)[..., 0]  # (geoms, 3)
         low, high = data.geom_xpos + middle - half, data.geom_xpos + middle + half
 
@@ -266,8 +317,9 @@ class RayCastCamera:
             geoms = (model.geom_bodyid == body) & VISIBLE[model.geom_group]
             if geoms.any():
                 width = high[geoms, 0].max() - low[geoms, 0].min()
-                scenery[geoms] = width >= self.high[0] - self.low[0]
-        return scenery
+                wide = width >= self.high[0] - self.low[0]
+                scenery[geoms] = wide or endless[geoms].any()
+        return scenery, high[scenery, 2].max(initial=-np.inf)
 
     def rays(self, pixels: int) -> np.ndarray:
         """Returns unit directions (pixels**2, 3), world frame, row by row from the top."""
@@ -310,37 +362,93 @@ class RayCastCamera:
         hit[distance < 0] = -1
         distance[distance < 0] = np.inf
 
-        # A ray t d with |d| = 1 meets a sphere where |t d - to_center| = radius.
         for site in self.sites if sites is None else sites:
-            to_center, radius = data.site_xpos[site] - self.origin, self.model.site_size[site, 0]
-            along = rays @ to_center  # (R,)
-            under_root = along**2 - (to_center @ to_center - radius**2)  # (R,)
-            near = np.flatnonzero((under_root >= 0) & (along > 0))
-            t = along[near] - np.sqrt(under_root[near])  # the first of its two solutions
-            closer = t < distance[near]
-            distance[near[closer]] = t[closer]
-            hit[near[closer]] = -2 - site
+            ball = data.site_xpos[site], np.eye(3), np.repeat(self.model.site_size[site, 0], 3)
+            t = meet_ellipsoid(self.origin, rays, *ball)
+            closer = t < distance
+            distance[closer] = t[closer]
+            hit[closer] = -2 - site
 
         return distance, hit
+
+    def cast_at_arm(self, data: mujoco.MjData, rays: np.ndarray) -> np.ndarray:
+        """Returns the distances (R,) in metres to the arm's ellipsoids, inf where none is met."""
+        distance = np.full(len(rays), np.inf)
+        for geom in self.arm:
+            axes, box = data.geom_xmat[geom].reshape(3, 3), self.model.geom_aabb[geom]
+            center = data.geom_xpos[geom] + axes @ box[:3]
+            t = meet_ellipsoid(self.origin, rays, center, axes, box[3:])
+            np.minimum(distance, t, out=distance)
+        return distance
 
     def points(self, data: mujoco.MjData) -> np.ndarray:
         """Returns what is seen of objects and sites in the workspace: (M, 3) float32, world frame.
 
-        The scenery gives no points, but hides what is behind it.
+        A ray a pixel is cast, and four where it meets a body or site that few others meet, or goes
+        by it. The scenery and the arm give no points, but hide what is behind them.
         """
+        targets = self.targets(data)
+        rays = self.workspace_rays  # (R, 3)
+        distance, hit = self.cast_at_things(data, *targets)
+        there = self.inside(rays, distance)  # (R,) bool
+
+        # The pixels of what few rays meet, and those beside them.
+        body = np.where(hit < 0, hit, self.model.geom_bodyid[hit])[there]  # or site, below 0
+        _, which, times = np.unique(body, return_inverse=True, return_counts=True)
+        small = np.zeros(self.in_workspace.shape, dtype=bool)  # (pixels, pixels)
+        small[self.in_workspace] = there
+        small[small] = times[which] < FEW_RAYS
+        small = binary_dilation(small)
+        there &= ~small[self.in_workspace]
+
+        more = self.fine_rays[small].reshape(-1, 3)
+        rays = np.concatenate([rays[there], more])
+        distance = np.concatenate([distance[there], self.cast(data, more, *targets)[0]])
+        rays, distance = self.unhidden(data, rays, distance)
+        seen = distance <= self.cast_at_arm(data, rays)
+        return (self.origin + distance[seen, None] * rays[seen]).astype(np.float32)
+
+    def cast_at_things(
+        self, data: mujoco.MjData, cutoff: float, things: np.ndarray, sites: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`cast` of the workspace's rays; what stands still is met once, until it is moved."""
+        rays, at = self.workspace_rays, (data.geom_xpos[self.still], data.geom_xmat[self.still])
+        if self.still_at is None or not all(map(np.array_equal, self.still_at, at)):
+            self.still_at, self.met_still = at, self.cast(data, rays, cutoff, self.still, ())
+        distance, hit = self.cast(data, rays, cutoff, things & ~self.still, sites)
+        still, what = self.met_still
+        return np.minimum(still, distance), np.where(still <= distance, what, hit)
+
+    def arm_points(self, data: mujoco.MjData) -> np.ndarray:
+        """Returns what is seen of the arm in the workspace: (M, 3) float32, on its ellipsoids."""
+        rays = self.workspace_rays
+        rays, distance = self.unhidden(data, rays, self.cast_at_arm(data, rays))
+        seen = distance <= self.cast(data, rays, *self.targets(data))[0]
+        return (self.origin + distance[seen, None] * rays[seen]).astype(np.float32)
+
+    def targets(self, data: mujoco.MjData) -> tuple[float, np.ndarray, np.ndarray]:
+        """What `cast` looks for: how far, (geoms,) bool and the sites of what becomes points."""
         # A site outside the workspace hides nothing: it marks a place, there is no body.
         center, radius = data.site_xpos[self.sites], self.model.site_size[self.sites, :1]
         outside = (center - radius >= self.high) | (center + radius <= self.low)
-        sites = self.sites[~outside.any(axis=1)]
+        return self.cutoff, self.things, self.sites[~outside.any(axis=1)]
 
-        rays = self.workspace_rays  # (R, 3)
-        distance, _ = self.cast(data, rays, self.cutoff, ~self.scenery, sites)
-        points = self.origin + np.minimum(distance, FAR)[:, None] * rays  # (R, 3)
-        inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
+    def inside(self, rays: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        """Which rays (R, 3) are in the workspace after `distance` (R,) metres, inf allowed."""
+        points = self.origin + np.minimum(distance, FAR)[:, None] * rays
+        return ((points >= self.low) & (points <= self.high)).all(axis=1)
 
-        # The scenery comes last, which saves time: most rays meet it, and few are left to cast.
-        barrier, _ = self.cast(data, rays[inside], self.cutoff, self.scenery, sites=())
-        return points[inside][distance[inside] <= barrier].astype(np.float32)  # (M, 3)
+    def unhidden(
+        self, data: mujoco.MjData, rays: np.ndarray, distance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Those rays (R, 3), and their `distance` (R,), that end before any scenery, in the box."""
+        there = self.inside(rays, distance)
+        rays, distance = rays[there], distance[there]
+        height = self.origin[2] + distance * rays[:, 2]  # where they end
+        near = np.minimum(height, self.origin[2]) <= self.top  # the others pass above all of it
+        barrier = np.full(len(rays), np.inf)
+        barrier[near], _ = self.cast(data, rays[near], self.cutoff, self.scenery, sites=())
+        return rays[distance <= barrier], distance[distance <= barrier]
 
     def depth(self, data: mujoco.MjData) -> np.ndarray:
         """Returns metres along the viewing direction (pixels, pixels), inf where nothing is hit."""
@@ -377,17 +485,20 @@ class RayCastCamera:
 
 CAMERA = "corner2"
 CAMERA_POSITION = (0.6, 0.295, 0.8)  # world frame, metres; the orientation stays Meta-World's
-CAMERA_PIXELS = 84
+CAMERA_PIXELS = 84  # twice as many where something small is
+ARM = tuple(f"right_l{i}" for i in range(7))  # the seven links; hand and fingers are no part of it
 RENDER_PIXELS = 240
 WORKSPACE = ((-0.55, 0.3, -0.05), (0.6, 1.0, 0.48))  # the table and its holes, below the upper arm
 NUM_POINTS = 512
+NUM_THINGS = 384  # of them at most are of objects, markers and the gripper, the rest of the arm
 
 
 class MetaWorldPointCloudEnv(gymnasium.Env):
     """A Meta-World task as a point cloud; also `gymnasium.make("DAMI/MetaWorld-v0", task="reach")`.
 
-    Observation: "point_cloud" (N, 3) float32, farthest point sampled, and "agent_pos" (9,) float32:
-    the positions of the end effector, the right and the left finger; world frame, metres.
+    Observation: "point_cloud" (N, 3) float32 and "agent_pos" (9,) float32, the positions of the end
+    effector, the right and the left finger; world frame, metres. In a cloud come first farthest
+    points of objects, goal marker and gripper, at most 384; those of the arm fill up the rest.
 
     Action (4,) in [-1, 1]: dx, dy, dz in centimetres, gripper (1 closes).
 
@@ -414,7 +525,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         self.expert = ENV_POLICY_MAP[f"{task}-v3"]()
 
         self.camera = RayCastCamera(
-            self.simulator.model, CAMERA_PIXELS, WORKSPACE, CAMERA, CAMERA_POSITION
+            self.simulator.model, CAMERA_PIXELS, WORKSPACE, CAMERA, CAMERA_POSITION, ARM
         )
         self.observation_space = gymnasium.spaces.Dict(
             {
@@ -459,9 +570,21 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         data = self.simulator.data
         fingers = [data.site("rightEndEffector").xpos, data.site("leftEndEffector").xpos]
         return {
-            "point_cloud": farthest_point_sample(self.camera.points(data), self.num_points),
+            "point_cloud": self.cloud(),
             "agent_pos": np.concatenate([data.body("hand").xpos, *fingers]).astype(np.float32),
         }
+
+    def cloud(self) -> np.ndarray:
+        """Returns N of the points that the camera sees, (N, 3) float32, the arm's last."""
+        N, data = self.num_points, self.simulator.data
+        cloud = self.camera.points(data)
+        cloud = (
+            farthest_point_sample(cloud, min(N, NUM_THINGS, len(cloud))) if len(cloud) else cloud
+        )
+        if len(cloud) < N and len(arm := self.camera.arm_points(data)):
+            arm = farthest_point_sample(arm, min(N - len(cloud), len(arm)))
+            cloud = np.concatenate([cloud, arm])
+        return np.resize(cloud, (N, 3))  # repeated from its beginning
 
     def expert_action(self) -> np.ndarray:
         """Returns the scripted expert's action (4,) float32 in [-1, 1] for the present moment."""
@@ -485,8 +608,8 @@ if "DAMI/MetaWorld-v0" not in gymnasium.registry:
 
 ATTEMPTS_PER_EPISODE = 20
 RECIPE = {
-    "made_by": "data.collect",  # the name of an older version, whose recordings are the same
-    "camera": [CAMERA, list(CAMERA_POSITION), CAMERA_PIXELS],
+    "camera": [CAMERA, list(CAMERA_POSITION), CAMERA_PIXELS, "twice where something small is"],
+    "arm": ["ellipsoids", "after at most", NUM_THINGS],
     "workspace": [list(corner) for corner in WORKSPACE],
     "num_points": NUM_POINTS,
     "sampling": "farthest points",
@@ -522,11 +645,9 @@ def collect(
             missing.append(task)
             continue
         old = load_demonstrations(path)
-        if old.task != task or old.meta | recipe != old.meta:
-            raise ValueError(
-                f"{path} was recorded otherwise (task, camera or seed): "
-                "move it or use another --data"
-            )
+        if other := made_otherwise(old, recipe | {"task": task}):
+            what = f"{path} was recorded with another {other}"
+            raise ValueError(f"{what}: move it or use another --data")
         if len(old) < episodes:
             missing.append(task)
 
@@ -568,6 +689,7 @@ def collect_task(task: str, path: Path, episodes: int, seed: int) -> None:
 
     packages = ("metaworld", "mujoco", "fpsample", "numpy")
     meta = RECIPE | {
+        "made_by": "simulator.collect",
         "seed": seed,
         "episode_seeds": seeds,
         "success_frames": successes,

@@ -85,7 +85,7 @@ def frame_times(task: str, frames: int = 100) -> dict[str, float]:
     """Milliseconds a frame of an expert episode, on one core: physics (and the expert), rays,
     sampling.
     """
-    env = MetaWorldPointCloudEnv(task)
+    env = MetaWorldPointCloudEnv(task, PRESETS["small"].num_points)
     env.begin(demonstration_seed(task, 0, 0))
     times = {"physics": [], "rays": [], "sampling": []}
     for _ in range(frames):

@@ -36,6 +36,15 @@ RESULTS = ROOT / "RESULTS.json"
 PAPER = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
 BASE, NOVEL = suite_tasks("ml10")
 TASKS = {"base": BASE, "novel": NOVEL}
+DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022)
+    "easy": [
+        *("reach", "door-open", "drawer-close", "button-press-topdown", "window-open"),
+        *("drawer-open", "door-close", "lever-pull"),
+    ],
+    "medium": ["peg-insert-side", "sweep", "basketball", "sweep-into"],
+    "hard": ["push", "pick-place"],
+    "very hard": ["shelf-place"],
+}
 VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-dami": "DAMI",
     "ml10-no-inner-loop": "without the inner loop",
@@ -139,6 +148,26 @@ def by_task_table(split: str) -> Callable[[dict], str]:
     return make
 
 
+def difficulty_table(results: dict) -> str:
+    """A row for the base tasks, and one for the novel tasks, of each difficulty."""
+    rows = []
+    for split, report in (("base", ("base", 0)), ("novel", ("novel", "after"))):
+        for difficulty, members in DIFFICULTY.items():
+            if not (tasks := [task for task in TASKS[split] if task in members]):
+                continue
+            cells = []
+            for variant in ("ml10-dami", "ml10-neither"):
+                found = [measured(run, *report) for run in runs_of(results, variant)]
+                episodes = [
+                    s for successes in found if successes for t in tasks for s in successes[t]
+                ]
+                cells.append(format_success(sum(episodes), len(episodes)) if episodes else "")
+            theirs = [np.mean([PAPER[split][t][name] for t in tasks]) for name in ("DP3", "DAMI")]
+            title = f"{split}, {difficulty} ({len(tasks)})"
+            rows.append([title, *cells, *(f"{value:.1f}" for value in theirs)])
+    return format_table([["tasks", "DAMI", "multi-task", "paper, DP3", "paper, DAMI"], *rows])
+
+
 def variants_table(results: dict) -> str:
     """What decides: a row a variant."""
     rows = []
@@ -181,6 +210,7 @@ TABLES = {
     "means": means_table,
     "base": by_task_table("base"),
     "novel": by_task_table("novel"),
+    "difficulty": difficulty_table,
     "variants": variants_table,
     "swap": swap_table,
 }

@@ -28,7 +28,7 @@ VARIANTS = {
     "neither": "--demo-encoder none --maml off",
     "first-order": "--maml first",
     "no-dropout": "--instruction-dropout 0",
-    "less-dropout": "--instruction-dropout 0.2",
+    "more-dropout": "--instruction-dropout 0.5",
     "no-support-only": "--support-only 0",
     "mlp": "--demo-encoder mlp",
     "mid": "--tcfm mid",

@@ -204,7 +204,7 @@ def test_a_rollout_can_be_watched(run, recorded, monkeypatch, capsys):
     assert Path("reach.gif").stat().st_size > 10_000
     printed = capsys.readouterr()
     assert "wrote reach.gif" in printed.out
-    assert "rolling out: 4chunk" in printed.err and "drawing: 100%" in printed.err
+    assert "rolling out: 24step" in printed.err and "drawing: 100%" in printed.err
 
 
 def test_an_adapted_policy_is_watched_from_its_folder(run, recorded, monkeypatch, capsys):
@@ -224,7 +224,7 @@ def test_an_adapted_policy_is_watched_from_its_folder(run, recorded, monkeypatch
 
 
 def test_a_movie_is_written_by_what_is_there(monkeypatch):
-    assert evaluate.movie_writer("x.gif").fps == 8
+    assert evaluate.movie_writer("x.gif").fps == evaluate.FPS
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(ValueError, match="install ffmpeg or `pip install imageio-ffmpeg`"):
