@@ -51,9 +51,10 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
     "ml10-scratch": "from random weights",
-    "before": "before: the instruction always told, inner rate 1e-4, DDIM",
-    "before-no-inner-loop": "before, without the inner loop",
+    "before": "until 2026-11-23: the instruction always told, inner rate 1e-4, DDIM",
+    "before-no-inner-loop": "until 2026-11-23, without the inner loop",
 }
+SHOWN = {"ml10-dami": "DAMI", "ml10-no-inner-loop": "no inner loop", "ml10-neither": "multi-task"}
 
 
 def take(results: dict, run: Path) -> None:
@@ -105,47 +106,45 @@ def mean(results: dict, variant: str, report: str, column: int | str = 0) -> str
 
 
 def means_table(results: dict) -> str:
-    """The means of DAMI, with and without the instruction, of multi-task training, the paper's."""
+    """The means of DAMI, without its inner loop, of multi-task training, and the paper's."""
     shown = {
-        "base tasks": (("base", 0), ("swap", 0), "base"),
-        "novel tasks, no gradient step": (("novel", "before"), ("alone", "before"), ""),
-        "novel tasks, 200 steps": (("novel", "after"), ("alone", "after"), "novel"),
+        "base tasks": ("base", 0, "base"),
+        "novel tasks, no gradient step": ("novel", "before", ""),
+        "novel tasks, 200 steps": ("novel", "after", "novel"),
     }
     rows = []
-    for title, (told, alone, split) in shown.items():
+    for title, (report, column, split) in shown.items():
         theirs = [
             f"{np.mean([PAPER[split][task][name] for task in TASKS[split]]):.1f}" if split else ""
             for name in ("DP3", "DAMI")
         ]
-        ours = [mean(results, "ml10-dami", *report) for report in (told, alone)]
-        rows.append([title, *ours, mean(results, "ml10-neither", *told), *theirs])
-    head = ["ML10", "DAMI", "DAMI, not told", "multi-task", "paper, DP3", "paper, DAMI"]
-    return format_table([head, *rows])
+        rows.append([title, *(mean(results, v, report, column) for v in SHOWN), *theirs])
+    return format_table([["ML10", *SHOWN.values(), "paper, DP3", "paper, DAMI"], *rows])
 
 
 def by_task_table(split: str) -> Callable[[dict], str]:
-    """A row a task: DAMI's seeds together, and the paper's."""
-    columns = {"DAMI": ("base", 0), "DAMI, not told": ("swap", 0)}
-    if split == "novel":
-        columns = {"no gradient step": ("novel", "before"), "200 steps": ("novel", "after")}
-        columns |= {f"{name}, not told": ("alone", place) for name, (_, place) in columns.items()}
+    """A row a task: each variant's seeds together, and the paper's."""
+    report = ("base", 0) if split == "base" else ("novel", "after")
 
     def make(results: dict) -> str:
         rows = []
         for task in TASKS[split]:
-            cells = []
-            for column in columns.values():
-                found = [measured(run, *column) for run in runs_of(results, "ml10-dami")]
-                episodes = [s for successes in found if successes for s in successes[task]]
-                cells.append(format_success(sum(episodes), len(episodes)) if episodes else "")
+            cells = [pooled(results, variant, report, [task]) for variant in SHOWN]
             theirs = [f"{PAPER[split][task][name]:.1f}" for name in ("DP3", "DAMI")]
             rows.append([task, *cells, *theirs])
-        means = [mean(results, "ml10-dami", *column) for column in columns.values()]
+        means = [mean(results, variant, *report) for variant in SHOWN]
         theirs = [np.mean([PAPER[split][t][n] for t in TASKS[split]]) for n in ("DP3", "DAMI")]
         rows.append(["**mean**", *means, *(f"{value:.1f}" for value in theirs)])
-        return format_table([["task", *columns, "paper, DP3", "paper, DAMI"], *rows])
+        return format_table([["task", *SHOWN.values(), "paper, DP3", "paper, DAMI"], *rows])
 
     return make
+
+
+def pooled(results: dict, variant: str, report: tuple[str, int | str], tasks: list[str]) -> str:
+    """The episodes of some tasks and of all of a variant's seeds together."""
+    found = [measured(run, *report) for run in runs_of(results, variant)]
+    episodes = [s for successes in found if successes for task in tasks for s in successes[task]]
+    return format_success(sum(episodes), len(episodes)) if episodes else ""
 
 
 def difficulty_table(results: dict) -> str:
@@ -155,17 +154,11 @@ def difficulty_table(results: dict) -> str:
         for difficulty, members in DIFFICULTY.items():
             if not (tasks := [task for task in TASKS[split] if task in members]):
                 continue
-            cells = []
-            for variant in ("ml10-dami", "ml10-neither"):
-                found = [measured(run, *report) for run in runs_of(results, variant)]
-                episodes = [
-                    s for successes in found if successes for t in tasks for s in successes[t]
-                ]
-                cells.append(format_success(sum(episodes), len(episodes)) if episodes else "")
+            cells = [pooled(results, variant, report, tasks) for variant in SHOWN]
             theirs = [np.mean([PAPER[split][t][name] for t in tasks]) for name in ("DP3", "DAMI")]
             title = f"{split}, {difficulty} ({len(tasks)})"
             rows.append([title, *cells, *(f"{value:.1f}" for value in theirs)])
-    return format_table([["tasks", "DAMI", "multi-task", "paper, DP3", "paper, DAMI"], *rows])
+    return format_table([["tasks", *SHOWN.values(), "paper, DP3", "paper, DAMI"], *rows])
 
 
 def variants_table(results: dict) -> str:
@@ -182,7 +175,8 @@ def variants_table(results: dict) -> str:
 def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
     """Policy -> what it is shown, and its episodes on the base tasks."""
     found = {}
-    for variant, title in (("before", "before"), ("ml10-dami", "DAMI")):
+    titles = {"before": "until 2026-11-23", "ml10-dami": "DAMI"}
+    for variant, title in (titles | {"ml10-no-inner-loop": "no inner loop"}).items():
         for run in runs_of(results, variant)[:1]:
             shown = [
                 ("instruction, own demonstration", measured(run, "told", 0)),
@@ -229,19 +223,20 @@ def draw_swap(results: dict, path: Path) -> None:
     """A bar for each thing that a policy can be shown: is the demonstration read?"""
     from matplotlib.figure import Figure
 
-    policies = {title: shown for title, shown in swaps(results).items() if shown}
-    figure = Figure(figsize=(8, 3.4), layout="constrained")
-    for axes, (title, shown) in zip(
-        np.atleast_1d(figure.subplots(1, len(policies))), policies.items()
-    ):
-        for place, (label, successes) in enumerate(reversed(shown)):
+    policies = {title: dict(shown) for title, shown in swaps(results).items() if shown}
+    labels = list(max(policies.values(), key=len))
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(policies), sharey=True))
+    for axes, (title, shown) in zip(panels, policies.items()):
+        for label, successes in shown.items():
             episodes = [s for task in successes.values() for s in task]
             rate, bounds = np.mean(episodes), wilson_interval(sum(episodes), len(episodes))
             error = 100 * np.abs(np.array(bounds)[:, None] - rate)
             color = "C3" if "another" in label else "C0"
-            axes.barh(place, 100 * rate, xerr=error, color=color, capsize=2)
-        axes.set_yticks(range(len(shown)), [label for label, _ in reversed(shown)], fontsize=8)
-        axes.set(xlabel="success on base tasks, %", xlim=(0, 100), title=title)
+            axes.barh(labels.index(label), 100 * rate, xerr=error, color=color, capsize=2)
+        axes.set_yticks(range(len(labels)), labels, fontsize=8)
+        axes.set(xlabel="success, %", xlim=(0, 100), ylim=(len(labels) - 0.4, -0.6))
+        axes.set_title(title, fontsize=10)
         axes.spines[["top", "right"]].set_visible(False)
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
 
@@ -281,12 +276,15 @@ def draw_adaptation(results: dict, path: Path) -> None:
 
 def draw_by_task(results: dict, path: Path) -> None:
     """Success by task, of all seeds together, beside the paper's."""
-    episodes: Successes = {task: [] for task in BASE + NOVEL}
-    for run in runs_of(results, "ml10-dami"):
-        for task, successes in (measured(run, "base") | measured(run, "novel", "after")).items():
-            episodes[task] += successes
+    columns: dict[str, Successes] = {}
+    for variant, label in SHOWN.items():
+        columns[label] = {task: [] for task in BASE + NOVEL}
+        for run in runs_of(results, variant):
+            found = measured(run, "base") | measured(run, "novel", "after")
+            for task, successes in found.items():
+                columns[label][task] += successes
     title = "base tasks directly, novel tasks (the last five) after 200 steps"
-    draw_success({"small": episodes}, path, title, "ml10")
+    draw_success(columns, path, title, "ml10")
 
 
 def ship(checkpoint: str) -> None:

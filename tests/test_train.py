@@ -500,7 +500,10 @@ def test_what_cannot_be_resumed_is_said(run, recorded, tmp_path, capsys):
     np.savez("alone/hammer.npz", **own_recording(task="hammer", state_dim=7))
     for script, data_ in ((train, "alone"), (finetune, "alone/hammer.npz")):
         message = fails(script, ["--data", data_], capsys)
-        assert "alone/hammer.npz is not Meta-World's hammer as recorded here (another camera" in message
+        assert (
+            "alone/hammer.npz is not Meta-World's hammer as recorded here (another camera"
+            in message
+        )
     assert [path.name for path in Path("alone").iterdir()] == ["hammer.npz"]
 
 
