@@ -1,5 +1,7 @@
 """Times the pieces that matter, on this machine, side by side: `python -m tests.bench [--paper]`.
 
+`--network` leaves out what a GPU has no part in: frames, episodes, and memory.
+
 Each figure is the median of the repetitions; what is compared takes turns, so that a slow minute of
 the machine meets all of it. The first round is not counted. Nothing else should be running.
 """
@@ -38,6 +40,7 @@ from tests.textbook import TextbookDP3, training_step
 from train import SETTINGS, Settings, multi_task_gradient, split, task_batch
 
 DP3 = {"demo_encoder": "none", "tcfm": "none"}
+TASKS = "reach", "shelf-place", "basketball"  # whose frames and episodes are timed
 
 
 def medians(functions: dict[str, Callable[[], object]], repeat: int) -> dict[str, float]:
@@ -343,6 +346,7 @@ def main(argv: list[str] | None = None) -> None:
         action="store_true",
         help="the ratios at the paper's size too (10 minutes more, 16 GB)",
     )
+    parser.add_argument("--network", action="store_true", help="only its steps")
     parser.add_argument("--inner-step", action="store_true", help="only what it does to a policy")
     parser.add_argument("--data", default="data", help="demonstrations that --inner-step reads")
     parser.add_argument("--inner-lr", type=float, help="its rate (default: of the training)")
@@ -370,27 +374,22 @@ def main(argv: list[str] | None = None) -> None:
         f"{time.strftime('%Y-%m-%d')}"
     )
 
-    print("\n| frame, one core, ms | physics | rays | sampling | all |\n|---|---|---|---|---|")
-    for task in ("reach", "shelf-place", "basketball"):
-        times = frame_times(task)
-        cells = [f"{ms:.1f}" for ms in (*times.values(), sum(times.values()))]
-        print(f"| {task} | {' | '.join(cells)} |", flush=True)
-    episodes = {
-        task: episode_seconds(task, device, args.repeat)
-        for task in ("reach", "shelf-place", "basketball")
-    }
-    table("evaluation, one core, `small`: seconds an episode of 200 steps", episodes)
+    if not args.network:
+        print("\n| frame, one core, ms | physics | rays | sampling | all |\n|---|---|---|---|---|")
+        for task in TASKS:
+            times = frame_times(task)
+            cells = [f"{ms:.1f}" for ms in (*times.values(), sum(times.values()))]
+            print(f"| {task} | {' | '.join(cells)} |", flush=True)
+        episodes = {task: episode_seconds(task, device, args.repeat) for task in TASKS}
+        table("evaluation, one core, `small`: seconds an episode of 200 steps", episodes)
+        memory = {f"{tasks} tasks": peak_memory(tasks) for tasks in (10, 20, 40)}
+        table("`small`, second order, peak memory, GB", memory)
 
     recorded = demonstration("drawer-close")
     rate = matrix_rate(device)
     print(f"\nmatrix product: {rate:.0f} GFLOP a second")
     for preset in ("small", "tiny"):
         preset_table(Bench(PRESETS[preset], preset, recorded, device), rate, args.repeat)
-    table(
-        "`small`, second order, peak memory, GB",
-        {f"{tasks} tasks": peak_memory(tasks) for tasks in (10, 20, 40)},
-    )
-
     for preset, steps, rounds in (("small", 4, 5), ("paper", 2, 3)):
         if preset == "paper" and not args.paper:
             continue

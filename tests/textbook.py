@@ -88,7 +88,7 @@ class UNet(nn.Module):
 
     def forward(self, noisy, timesteps, observation):
         half = self.width // 2
-        rates = 10000 ** (-torch.arange(half) / (half - 1))
+        rates = 10000 ** (-torch.arange(half, device=noisy.device) / (half - 1))
         angles = timesteps[:, None] * rates[None]
         step = self.timestep_mlp(torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1))
         condition = torch.cat([step, observation], dim=-1)
