@@ -607,13 +607,14 @@ def begin_run(
     config: PolicyConfig,
     facts: dict[str, Any],
 ) -> None:
-    """Prints the settings, writes them to a new run's config.json, drops what was logged later."""
+    """Prints the settings, writes them to config.json, drops what was logged later than `start`."""
     used = asdict(settings) | asdict(config)
     usual = asdict(preset) | asdict(PRESETS[config.policy][settings.preset])
     print_settings(used, usual)
-    if start == 0:
-        written = {"arguments": asdict(settings), "config": asdict(config), **facts}
-        write_text(folder / "config.json", json.dumps(written, indent=1))
+    path = folder / "config.json"
+    begun = json.loads(path.read_text()) if start and path.exists() else facts
+    written = begun | {"arguments": asdict(settings), "config": asdict(config)}
+    write_text(path, json.dumps(written, indent=1))
     rewind_metrics(folder, start)
 
 

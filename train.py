@@ -79,7 +79,7 @@ SETTINGS = {
         multi_task_share=0.8,  # a quarter of the time a step, and nearly the same gradient
         after_success=20,  # three in five of the experts' frames are later
         instruction_dropout=0.2,  # or the demonstration is not read
-        support_only=0.25, inner_lr=3e-2,  # or the inner step has nothing to say
+        support_only=0.25, inner_lr=3e-3,  # or the inner step has nothing to say
         vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=10_000,
     ),
     "tiny": Settings(

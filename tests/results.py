@@ -47,7 +47,9 @@ DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022)
 }
 VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-dami": "DAMI",
+    "ml10-inner-3e-2": "DAMI with an inner rate of 3e-2",
     "ml10-no-inner-loop": "without the inner loop",
+    "ml10-no-inner-loop-cpu": "without the inner loop, seed 0, trained on two cores",
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
     "ml10-scratch": "from random weights",
@@ -176,7 +178,7 @@ def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
     """Policy -> what it is shown, and its episodes on the base tasks."""
     found = {}
     titles = {"before": "until 2026-11-23", "ml10-dami": "DAMI"}
-    for variant, title in (titles | {"ml10-no-inner-loop": "no inner loop"}).items():
+    for variant, title in (titles | {"ml10-no-inner-loop-cpu": "no inner loop"}).items():
         for run in runs_of(results, variant)[:1]:
             shown = [
                 ("instruction, own demonstration", measured(run, "told", 0)),
@@ -245,9 +247,9 @@ def draw_adaptation(results: dict, path: Path) -> None:
     """Success on novel tasks against gradient steps, and against the number of demonstrations."""
     from matplotlib.figure import Figure
 
-    shots = [(n, f"{n}-shot", "after") for n in (1, 3, 5)] + [(10, "curve", "200 steps")]
-    steps = [(0, "curve", "before"), *((n, "curve", f"{n} steps") for n in (1, 5, 20, 50, 200))]
-    panels = {"gradient steps, ten demonstrations": [*steps, (1000, "curve", "after")]}
+    shots = [(n, f"{n}-shot", "after") for n in (1, 3, 5)] + [(10, "curve", "after")]
+    steps = [(0, "curve", "before"), *((n, "curve", f"{n} steps") for n in (1, 5, 20, 50))]
+    panels = {"gradient steps, ten demonstrations": [*steps, (200, "curve", "after")]}
     panels["demonstrations, 200 gradient steps"] = shots
     figure = Figure(figsize=(8, 3.8), layout="constrained")
     for axes, (label, points) in zip(figure.subplots(1, 2, sharey=True), panels.items()):

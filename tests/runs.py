@@ -24,9 +24,10 @@ from scripts import choose, command_line
 VARIANTS = {
     "dami": "",
     "no-inner-loop": "--maml off",
-    "no-demonstration": "--demo-encoder none --inner-lr 3e-3",
+    "no-demonstration": "--demo-encoder none",
     "neither": "--demo-encoder none --maml off",
     "first-order": "--maml first",
+    "inner-3e-2": "--inner-lr 3e-2",
     "no-dropout": "--instruction-dropout 0",
     "more-dropout": "--instruction-dropout 0.5",
     "no-support-only": "--support-only 0",
@@ -53,7 +54,7 @@ REPORTS = {  # name -> command, of which variants (all: ()); {run} is the run's 
     "alone": ("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
 }
 # Along the adaptation, and with fewer demonstrations: 20 episodes, not told where that can be.
-CURVE = {"curve": "--steps 1000 --curve 1 5 20 50 200"}
+CURVE = {"curve": "--curve 1 5 20 50"}
 CURVE |= {f"{n}-shot": f"--demonstrations {n}" for n in (1, 3, 5)}
 for name, flags in CURVE.items():
     REPORTS[name] = (f"finetune.py --task novel --checkpoint {{run}} --episodes 20 {flags}", SHOWN)

@@ -439,6 +439,8 @@ def test_what_concerns_the_inner_step_may_differ_before_the_first_one(run, recor
     last["arguments"]["multi_task_share"] = 1.0
     torch.save(last, tmp_path / "run" / "last.pt")
     train.main([*argv, *other, "--multi-task-share", "1"])
+    said = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert said["arguments"]["inner_lr"] == 0.5 and "date" in said
 
 
 # ---- Bad input -----------------------------------------------------------------------------------
