@@ -25,6 +25,7 @@ from evaluate import (
     format_success,
     mean_interval,
     mean_success,
+    pooled_success,
     wilson_interval,
 )
 from scripts import format_table, load_checkpoint, save_checkpoint
@@ -49,12 +50,17 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-dami": "DAMI",
     "ml10-inner-3e-2": "DAMI with an inner rate of 3e-2",
     "ml10-no-inner-loop": "without the inner loop",
-    "ml10-no-inner-loop-cpu": "without the inner loop, seed 0, trained on two cores",
+    "ml10-no-inner-loop-cpu": "without the inner loop, trained on two cores",
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
     "ml10-scratch": "from random weights",
     "before": "until 2026-11-23: the instruction always told, inner rate 1e-4, DDIM",
     "before-no-inner-loop": "until 2026-11-23, without the inner loop",
+}
+SWAPPED = {  # a run -> its panel in the swap chart
+    "before-seed0": "until 2026-11-23",
+    "ml10-dami-seed0": "DAMI, seed 0",
+    "ml10-no-inner-loop-cpu-seed0": "what ships",
 }
 SHOWN = {"ml10-dami": "DAMI", "ml10-no-inner-loop": "no inner loop", "ml10-neither": "multi-task"}
 
@@ -177,18 +183,28 @@ def variants_table(results: dict) -> str:
 def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
     """Policy -> what it is shown, and its episodes on the base tasks."""
     found = {}
-    titles = {"before": "until 2026-11-23", "ml10-dami": "DAMI"}
-    for variant, title in (titles | {"ml10-no-inner-loop-cpu": "no inner loop"}).items():
-        for run in runs_of(results, variant)[:1]:
-            shown = [
-                ("instruction, own demonstration", measured(run, "told", 0)),
-                ("instruction, another's demonstration", measured(run, "told", 1)),
-                ("another's instruction, own demonstration", measured(run, "told", 2)),
-                ("own demonstration alone", measured(run, "swap", 0)),
-                ("another's demonstration alone", measured(run, "swap", 1)),
-            ]
-            found[title] = [(label, successes) for label, successes in shown if successes]
+    for name, title in SWAPPED.items():
+        run = results.get(name, {})
+        shown = [
+            ("instruction, own demonstration", measured(run, "told", 0)),
+            ("instruction, another's demonstration", measured(run, "told", 1)),
+            ("another's instruction, own demonstration", measured(run, "told", 2)),
+            ("own demonstration alone", measured(run, "swap", 0)),
+            ("another's demonstration alone", measured(run, "swap", 1)),
+        ]
+        found[title] = [(label, successes) for label, successes in shown if successes]
     return found
+
+
+def reading_table(results: dict) -> str:
+    """A row a run that is told nothing: success with its own demonstration, with another task's."""
+    rows = [["run", "own demonstration alone", "another's demonstration alone"]]
+    for variant, title in VARIANTS.items():
+        for run in runs_of(results, variant):
+            if "swap" in run:
+                cells = [pooled_success(measured(run, "swap", column)) for column in (0, 1)]
+                rows.append([f"{title}, seed {run['training']['arguments']['seed']}", *cells])
+    return format_table(rows)
 
 
 def swap_table(results: dict) -> str:
@@ -196,8 +212,7 @@ def swap_table(results: dict) -> str:
     policies = swaps(results)
     for title, shown in policies.items():
         for label, successes in shown:
-            episodes = [s for task in successes.values() for s in task]
-            rows.setdefault(label, {})[title] = format_success(sum(episodes), len(episodes))
+            rows.setdefault(label, {})[title] = pooled_success(successes)
     cells = [[label, *(by.get(title, "") for title in policies)] for label, by in rows.items()]
     return format_table([["what the policy sees", *policies], *cells])
 
@@ -209,6 +224,7 @@ TABLES = {
     "difficulty": difficulty_table,
     "variants": variants_table,
     "swap": swap_table,
+    "reading": reading_table,
 }
 
 
