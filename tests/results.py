@@ -252,6 +252,8 @@ def draw_swap(results: dict, path: Path) -> None:
             error = 100 * np.abs(np.array(bounds)[:, None] - rate)
             color = "C3" if "another" in label else "C0"
             axes.barh(labels.index(label), 100 * rate, xerr=error, color=color, capsize=2)
+        for label in set(labels) - set(shown):
+            axes.text(3, labels.index(label), "not measured", va="center", fontsize=8)
         axes.set_yticks(range(len(labels)), labels, fontsize=8)
         axes.set(xlabel="success, %", xlim=(0, 100), ylim=(len(labels) - 0.4, -0.6))
         axes.set_title(title, fontsize=10)
