@@ -612,8 +612,10 @@ def begin_run(
     usual = asdict(preset) | asdict(PRESETS[config.policy][settings.preset])
     print_settings(used, usual)
     path = folder / "config.json"
-    begun = json.loads(path.read_text()) if start and path.exists() else facts
-    written = begun | {"arguments": asdict(settings), "config": asdict(config)}
+    if start:  # it began as that file says, if the file can be read
+        with suppress(OSError, ValueError, TypeError):
+            facts = facts | dict(json.loads(path.read_text()))
+    written = facts | {"arguments": asdict(settings), "config": asdict(config)}
     write_text(path, json.dumps(written, indent=1))
     rewind_metrics(folder, start)
 

@@ -109,8 +109,12 @@ def mean(results: dict, variant: str, report: str, column: int | str = 0) -> str
         return ""
     if len(found) > 1:
         return mean_interval([mean_success(successes) for successes in found])
-    episodes = [s for task in found[0].values() for s in task]
-    return f"{format_success(sum(episodes), len(episodes))} (one run)"
+    return f"{pooled_success(found[0])} (one run)"
+
+
+def papers(split: str, tasks: list[str]) -> list[str]:
+    """The paper's success of DP3 and of DAMI, the mean over some tasks."""
+    return [f"{np.mean([PAPER[split][t][name] for t in tasks]):.1f}" for name in ("DP3", "DAMI")]
 
 
 def means_table(results: dict) -> str:
@@ -122,10 +126,7 @@ def means_table(results: dict) -> str:
     }
     rows = []
     for title, (report, column, split) in shown.items():
-        theirs = [
-            f"{np.mean([PAPER[split][task][name] for task in TASKS[split]]):.1f}" if split else ""
-            for name in ("DP3", "DAMI")
-        ]
+        theirs = papers(split, TASKS[split]) if split else ["", ""]
         rows.append([title, *(mean(results, v, report, column) for v in SHOWN), *theirs])
     return format_table([["ML10", *SHOWN.values(), "paper, DP3", "paper, DAMI"], *rows])
 
@@ -138,11 +139,9 @@ def by_task_table(split: str) -> Callable[[dict], str]:
         rows = []
         for task in TASKS[split]:
             cells = [pooled(results, variant, report, [task]) for variant in SHOWN]
-            theirs = [f"{PAPER[split][task][name]:.1f}" for name in ("DP3", "DAMI")]
-            rows.append([task, *cells, *theirs])
+            rows.append([task, *cells, *papers(split, [task])])
         means = [mean(results, variant, *report) for variant in SHOWN]
-        theirs = [np.mean([PAPER[split][t][n] for t in TASKS[split]]) for n in ("DP3", "DAMI")]
-        rows.append(["**mean**", *means, *(f"{value:.1f}" for value in theirs)])
+        rows.append(["**mean**", *means, *papers(split, TASKS[split])])
         return format_table([["task", *SHOWN.values(), "paper, DP3", "paper, DAMI"], *rows])
 
     return make
@@ -163,9 +162,8 @@ def difficulty_table(results: dict) -> str:
             if not (tasks := [task for task in TASKS[split] if task in members]):
                 continue
             cells = [pooled(results, variant, report, tasks) for variant in SHOWN]
-            theirs = [np.mean([PAPER[split][t][name] for t in tasks]) for name in ("DP3", "DAMI")]
             title = f"{split}, {difficulty} ({len(tasks)})"
-            rows.append([title, *cells, *(f"{value:.1f}" for value in theirs)])
+            rows.append([title, *cells, *papers(split, tasks)])
     return format_table([["tasks", *SHOWN.values(), "paper, DP3", "paper, DAMI"], *rows])
 
 

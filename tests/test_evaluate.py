@@ -306,8 +306,8 @@ def test_your_own_simulator_is_rolled_out_in(monkeypatch):
 
     def rollout():
         generator = torch.Generator().manual_seed(0)
-        watch = lambda: seen.append(envs[0].steps)  # noqa: E731
-        return evaluate.rollout(policy, envs, [5, 6], sampler, text, generator, watch)
+        how = sampler, text, generator, lambda: seen.append(envs[0].steps)
+        return evaluate.rollout(policy, envs, [5, 6], *how)
 
     assert all(type(success) is bool for success in rollout())
     assert all(env.steps <= 40 for env in envs) and seen == list(range(0, envs[0].steps, 8))

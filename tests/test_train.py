@@ -439,8 +439,12 @@ def test_what_concerns_the_inner_step_may_differ_before_the_first_one(run, recor
     last["arguments"]["multi_task_share"] = 1.0
     torch.save(last, tmp_path / "run" / "last.pt")
     train.main([*argv, *other, "--multi-task-share", "1"])
-    said = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert said["arguments"]["inner_lr"] == 0.5 and "date" in said
+    config, begun = tmp_path / "run" / "config.json", json.loads((run / "config.json").read_text())
+    said = json.loads(config.read_text())
+    assert said["arguments"]["inner_lr"] == 0.5 and said["command"] == begun["command"]
+    config.write_text("{")  # edited by hand
+    train.main([*argv, *other, "--multi-task-share", "1"])
+    assert json.loads(config.read_text()).keys() == begun.keys()
 
 
 # ---- Bad input -----------------------------------------------------------------------------------
