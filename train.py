@@ -59,6 +59,7 @@ class Settings(Flags):
     warmup: int = setting(500, "steps of linear warm-up", least=0)
     multi_task_share: float = setting(0.0, "first steps without an inner step", least=0, most=1)
     vectorize: int = setting(1, "tasks that run at once; memory is for so many", least=1)
+    bfloat16: bool = setting(False, "products of steps without an inner step in bfloat16")
     after_success: int | None = setting(None, "windows begin at most so much later", least=0)
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
     instruction_dropout: float = setting(0.0, "share of batches without it", least=0, most=1)
@@ -134,13 +135,13 @@ def split(batch: dict[str, Tensor], n: int) -> tuple[dict[str, Tensor], dict[str
 
 
 def multi_task_gradient(
-    policy: DAMIPolicy, batches: list[dict[str, Tensor]]
+    policy: DAMIPolicy, batches: list[dict[str, Tensor]], bfloat16: bool = False
 ) -> tuple[dict[str, Tensor], Tensor]:
     """The gradient of ordinary multi-task training: all windows of all tasks, no inner step."""
     if len({batch["demo_points"].shape for batch in batches}) == 1:
-        together = {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
-        loss = policy.loss(**together)
-    else:  # demonstrations of different lengths
+        batches = [{name: torch.cat([b[name] for b in batches]) for name in batches[0]}]
+    # else demonstrations of different lengths
+    with torch.autocast(batches[0]["action"].device.type, torch.bfloat16, enabled=bfloat16):
         loss = torch.stack([policy.loss(**batch) for batch in batches]).mean()
     parameters = dict(policy.named_parameters())
     gradients = torch.autograd.grad(loss, list(parameters.values()))
@@ -221,7 +222,7 @@ def meta_train(
 
         # The gradient of the mean loss over my tasks
         if not inner:
-            gradients, losses = multi_task_gradient(policy, list(batches))
+            gradients, losses = multi_task_gradient(policy, list(batches), settings.bfloat16)
             figures = {}
         else:  # lines 4 to 19: the inner step on support, the gradient of the query loss through it
             pairs = (split(batch, settings.support) for batch in batches)
