@@ -33,7 +33,7 @@ from torch import Tensor
 
 import scripts
 from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
-from model import CHOICES, DAMIPolicy
+from model import DAMIPolicy
 from scripts import (
     at_least,
     checkpoints_of,
@@ -330,9 +330,9 @@ def judge(
 loaded: dict[str, Any] = {}  # what a worker process keeps between jobs: policy and environments
 
 
-def load_policy(checkpoint: str, device: str, sampler: str | None = None) -> None:
+def load_policy(checkpoint: str, device: str, changed: dict[str, Any]) -> None:
     """Sets up a worker process."""
-    loaded.update(policy=load_checkpoint(checkpoint, device, sampler=sampler)[0], task=None)
+    loaded.update(policy=load_checkpoint(checkpoint, device, **changed)[0], task=None)
 
 
 def rollout_job(
@@ -374,7 +374,7 @@ def evaluate(
     device: str | torch.device = "cpu",
     n_demonstrations: int | None = None,
     blank: bool = False,
-    sampler: str | None = None,
+    **changed: Any,
 ) -> Successes:
     """Rolls a checkpoint out on Meta-World tasks in parallel processes.
 
@@ -388,7 +388,7 @@ def evaluate(
         device: where the policy runs.
         n_demonstrations: use only the first so many of each file; None: all.
         blank: the policy sees zeros in place of its demonstration.
-        sampler: of the diffusion, ddim or dp3; None: as it was trained with.
+        changed: of the policy's configuration, for the rollouts: sampler, n_action_steps.
 
     Returns:
         task -> E booleans, in the order of the episodes. They do not depend on `workers`.
@@ -401,7 +401,7 @@ def evaluate(
         for task, path in demonstrations.items()
         for chunk in chunks
     ]
-    setup = (load_policy, str(checkpoint), str(device), sampler)
+    setup = (load_policy, str(checkpoint), str(device), changed)
     found = run_jobs(
         rollout_job, jobs, workers, len(demonstrations) * episodes, "evaluating", setup
     )
@@ -688,7 +688,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     )
     parts = {"nargs": "+", "choices": ("demonstration", "instruction"), "default": []}
     add("--swap", **parts, help="measure also with these of another task")
-    add("--sampler", choices=CHOICES["sampler"], help="DDIM as published, or as DP3 runs it")
+    scripts.add_inference_flags(add)
     add("--without", **parts, help="leave these out: zeros in their place")
     add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
@@ -738,7 +738,8 @@ def main(argv: list[str] | None = None) -> None:
     labels = {path: f"{path.resolve().parent.name}/{path.stem}" for run in runs for path in run}
     if len(set(labels.values())) < sum(map(len, runs)):
         raise ValueError("two checkpoints have the same folder and file name: rename one's folder")
-    policy, info = load_checkpoint(runs[0][-1], device, needs=TRAINED, sampler=args.sampler)
+    changed = scripts.inference(args)
+    policy, info = load_checkpoint(runs[0][-1], device, needs=TRAINED, **changed)
 
     # Tasks, their demonstrations and instructions
     suite = args.suite or info["suite"]
@@ -773,9 +774,7 @@ def main(argv: list[str] | None = None) -> None:
 
         facts = {"title": " ".join(args.task or []) or f"{suite}, {args.split} tasks"}
         facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
-        facts |= scripts.report_facts("evaluate.py", argv, device)
-        if args.sampler:
-            facts["sampler"] = args.sampler
+        facts |= scripts.report_facts("evaluate.py", argv, device) | changed
         if args.without:
             facts["without"] = " and ".join(args.without)
         if "instruction" in args.without:
@@ -796,15 +795,15 @@ def measure(
     """Rolls out the checkpoints of all runs (path -> label), and reports."""
     blank = "demonstration" in args.without
     protocol = (args.episodes, args.seed, args.workers, device, args.demonstrations, blank)
-    protocol += (args.sampler,)
+    changed = scripts.inference(args)
     results, swapped = {}, {}
     for checkpoint in labels:
-        results[checkpoint] = evaluate(checkpoint, paths, text, *protocol)
+        results[checkpoint] = evaluate(checkpoint, paths, text, *protocol, **changed)
         for part in args.swap:
             inputs = {"demonstration": paths, "instruction": text}
             inputs[part] = of_next_task(inputs[part])
             label = f"{labels[checkpoint]}, {part} of another task"
-            swapped[label] = evaluate(checkpoint, *inputs.values(), *protocol)
+            swapped[label] = evaluate(checkpoint, *inputs.values(), *protocol, **changed)
 
     for name, part in parts_of(list(paths), suite).items():
         of_part = {path: {task: found[task] for task in part} for path, found in results.items()}

@@ -109,14 +109,16 @@ def adapt_checkpoint(
     folder: Path,
     settings: Settings,
     curve: Sequence[int] = (),
+    **changed: Any,
 ) -> dict[str, Any]:
     """Adapts the policy of a checkpoint to the task of a recording, on the device of `text`.
 
     Writes adapted.pt (a checkpoint like any other; after the steps in `curve` adapted-STEP.pt),
     metrics.jsonl and config.json to `folder`; returns what config.json says, `seconds` among it.
-    Raises ValueError where the two files do not fit each other.
+    What is in `changed` takes the place of the same in the policy's configuration. Raises
+    ValueError where the two files do not fit each other.
     """
-    policy, info = load_checkpoint(checkpoint, text.device, needs=evaluate.TRAINED)
+    policy, info = load_checkpoint(checkpoint, text.device, evaluate.TRAINED, **changed)
     demonstrations = load_demonstrations(data).take(settings.demonstrations)
     trained, device, task = info["arguments"], text.device, demonstrations.task
     how = policy.config, device, trained.get("after_success")
@@ -173,6 +175,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--curve", nargs="+", type=int, default=[], help="roll out after these steps, too")
     add("--out", help="folder of the adapted policy (default: runs/finetune/TASK-seedSEED)")
     add("--overwrite", action="store_true", help="replace what is in that folder")
+    scripts.add_inference_flags(add)
     scripts.add_common_flags(add)
     rates = f"Learning rates at a meta-training rate of {PAPER_LEARNING_RATE:g}: {LEARNING_RATES}."
     Settings.add_flags(parser.add_argument_group("settings", rates))
@@ -200,7 +203,8 @@ def main(argv: list[str] | None = None) -> None:
         tasks = [check_task(task) for task in args.task]
     start = args.checkpoint or evaluate.default_checkpoint(args.suite if simulated else "own")
     checkpoint = scripts.checkpoints_of(start)[-1]
-    _, info = load_checkpoint(checkpoint, needs=evaluate.TRAINED)
+    changed = scripts.inference(args)
+    _, info = load_checkpoint(checkpoint, needs=evaluate.TRAINED, **changed)
     where = f"{device} ({scripts.hardware(device)})"
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {where}", flush=True)
 
@@ -229,14 +233,14 @@ def main(argv: list[str] | None = None) -> None:
         results, seconds = {column: {} for column in columns}, 0.0
         for task, out in folders.items():
             arguments = checkpoint, paths[task], text[task], out, settings, between
-            took = adapt_checkpoint(*arguments)["seconds"]
+            took = adapt_checkpoint(*arguments, **changed)["seconds"]
             seconds += took
             print(f"adapted to {task} in {took:.1f} s; wrote {out / 'adapted.pt'}", flush=True)
             if simulated and settings.episodes:
                 protocol = (settings.episodes, settings.seed, args.workers, device)
                 for column, policy in columns.items():
                     of_task = {task: paths[task]}, text, *protocol, settings.demonstrations
-                    results[column] |= evaluate.evaluate(out / policy, *of_task)
+                    results[column] |= evaluate.evaluate(out / policy, *of_task, **changed)
         if not results["after"]:
             return  # own recordings have no simulator to be rolled out in
 
@@ -244,7 +248,7 @@ def main(argv: list[str] | None = None) -> None:
         facts |= {"checkpoint": str(checkpoint), "seconds a task": round(seconds / len(tasks), 1)}
         kept = ("steps", "demonstrations", "episodes", "seed", "instruction")
         facts |= {"text weights": identity} | {key: getattr(settings, key) for key in kept}
-        facts |= scripts.report_facts("finetune.py", argv, device)
+        facts |= scripts.report_facts("finetune.py", argv, device) | changed
         print(f"\n{evaluate.write_report(folder, results, facts, info['suite'])}")
 
 

@@ -752,7 +752,7 @@ class WinningPoints(torch.autograd.Function):
             for weight, bias, norm_weight, norm_bias in zip(*(layers[i::4] for i in range(4))):
                 x = F.linear(x, weight, bias)  # (at_once, N, width)
                 x = F.layer_norm(x, bias.shape, norm_weight, norm_bias).relu_()
-            winners.append(x.argmax(dim=-2))  # (at_once, widths[-1])
+            winners.append(x.max(dim=-2).indices)  # (at_once, widths[-1]); faster than argmax
         won = torch.zeros(clouds.shape[:-1], dtype=torch.int8, device=points.device)
         return won.scatter_(-1, torch.cat(winners), 1).view(points.shape[:-1])
 

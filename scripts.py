@@ -107,6 +107,18 @@ def add_architecture_flags(parser: argparse.ArgumentParser) -> None:
         add(f"--{name.replace('_', '-')}", help=what + of_presets(values), **options)
 
 
+def add_inference_flags(add: Callable[..., Any]) -> None:
+    """Adds the flags of what may be another in a rollout than in the training, see `inference`."""
+    add("--sampler", choices=CHOICES["sampler"], help="DDIM as published, or as DP3 runs it")
+    add("--n-action-steps", type=int, help="actions until the policy looks again")
+
+
+def inference(args: argparse.Namespace) -> dict[str, Any]:
+    """What was given of the flags of `add_inference_flags`, by the names of `PolicyConfig`."""
+    given = {name: getattr(args, name) for name in ("sampler", "n_action_steps")}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 def format_table(rows: Sequence[Sequence[Any]]) -> str:
     """A Markdown table, the first row its head, whose columns are aligned in a terminal too."""
     rows = [[str(cell) for cell in row] for row in rows]
@@ -372,16 +384,13 @@ def checkpoints_of(path: str | Path) -> list[Path]:
 
 
 def load_checkpoint(
-    path: str | Path,
-    device: str | torch.device = "cpu",
-    needs: Sequence[str] = (),
-    sampler: str | None = None,
+    path: str | Path, device: str | torch.device = "cpu", needs: Sequence[str] = (), **changed: Any
 ) -> tuple[DAMIPolicy, dict[str, Any]]:
     """Rebuilds the policy of a checkpoint, a folder's last, in evaluation mode on `device`.
 
-    Returns (policy, info): info is everything else in the file. `sampler` takes the place of that
-    in the configuration. Raises ValueError for a file that is missing, damaged, not one of ours,
-    lacks a name in `needs`, or whose weights do not fit.
+    Returns (policy, info): info is everything else in the file. What is in `changed` takes the
+    place of the same in the configuration. Raises ValueError for a file that is missing, damaged,
+    not one of ours, lacks a name in `needs`, or whose weights do not fit.
     """
     path = checkpoints_of(path)[-1]
     if not path.is_file():
@@ -403,7 +412,7 @@ def load_checkpoint(
         raise ValueError(f"{path} is not a file of train.py or finetune.py{lacks}: use such a one")
     try:
         config, weights = PolicyConfig(**info.pop("config")), info.pop("model")
-        config = replace(config, sampler=sampler or config.sampler)
+        config = replace(config, **changed)
         with torch.device("meta"):  # no memory for a size that the file does not hold
             build_policy(config).load_state_dict({k: x.to("meta") for k, x in weights.items()})
         policy = build_policy(config).to(device)

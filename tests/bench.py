@@ -21,12 +21,13 @@ import torch
 from torch.func import functional_call
 from torch.utils.flop_counter import FlopCounterMode
 
+import baselines
 from clip import text_features
 from data import Demonstrations, WindowSampler, farthest_point_sample, load_demonstrations
 from evaluate import EPISODES_A_JOB, SHIPPED_CHECKPOINT, TRAINED, checkpoints_of, rollout
 from finetune import BATCH, LEARNING_RATES, adapt_policy
 from maml import adapt, meta_gradient
-from model import PRESETS, DAMIPolicy, PolicyConfig
+from model import PRESETS, PolicyConfig
 from scripts import hardware, load_checkpoint, pick_device
 from simulator import (
     MetaWorldPointCloudEnv,
@@ -126,7 +127,7 @@ class Bench:
     ):
         torch.manual_seed(0)
         self.preset, self.settings = preset, SETTINGS[preset]
-        self.policy = DAMIPolicy(config).to(device)
+        self.policy = baselines.build_policy(config).to(device)
         self.sampler: WindowSampler = WindowSampler(recorded, config, device)
         self.policy.normalizer.fit(self.sampler.points, self.sampler.state, self.sampler.action)
         self.text = torch.randn(config.text_dim, generator=torch.Generator().manual_seed(0)).to(
@@ -339,6 +340,29 @@ def preset_table(bench: Bench, rate: float, repeat: int) -> None:
     table(f"`{bench.preset}`: second order over", ratios)
 
 
+def policies_table(recorded: Demonstrations, device: torch.device, repeat: int) -> None:
+    """`small`: what training and control of each policy of baselines.py cost, taking turns."""
+    calls, actions = {}, {}
+    for policy, presets in baselines.PRESETS.items():
+        bench = Bench(presets["small"], "small", recorded, device)
+        batches, actions[policy] = bench.batches(10), presets["small"].n_action_steps
+        calls |= {
+            (policy, "multi-task step"): lambda bench=bench, batches=batches: multi_task_gradient(
+                bench.policy, batches
+            ),
+            (policy, "second order"): lambda bench=bench, batches=batches: bench.outer_step(
+                batches, first_order=False
+            ),
+            (policy, "control step"): bench.control(),
+        }
+    ms = medians(calls, repeat)
+    print("\n| `small`, ms | multi-task step | second order | control step | of so many actions |")
+    print("|---|---|---|---|---|")
+    for policy, n in actions.items():
+        cells = [f"{value:.0f}" for (name, _), value in ms.items() if name == policy]
+        print(f"| {policy} | {' | '.join(cells)} | {n} |", flush=True)
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
@@ -390,6 +414,7 @@ def main(argv: list[str] | None = None) -> None:
     print(f"\nmatrix product: {rate:.0f} GFLOP a second")
     for preset in ("small", "tiny"):
         preset_table(Bench(PRESETS[preset], preset, recorded, device), rate, args.repeat)
+    policies_table(recorded, device, args.repeat)
     for preset, steps, rounds in (("small", 4, 5), ("paper", 2, 3)):
         if preset == "paper" and not args.paper:
             continue

@@ -62,6 +62,12 @@ SWAPPED = {  # a run -> its panel in the swap chart
     "ml10-dami-seed0": "DAMI, seed 0",
     "ml10-no-inner-loop-cpu-seed0": "what ships",
 }
+POLICIES = {  # of baselines.py -> what the paper calls it
+    "dp3": "DP3",
+    "flow": "FlowPolicy",
+    "mamba": "Mamba",
+    "freq": "FreqPolicy",
+}
 SHOWN = {"ml10-dami": "DAMI", "ml10-no-inner-loop": "no inner loop", "ml10-neither": "multi-task"}
 
 
@@ -147,10 +153,18 @@ def by_task_table(split: str) -> Callable[[dict], str]:
     return make
 
 
+def together(
+    results: dict, variant: str, report: tuple[str, int | str], tasks: list[str] | None = None
+) -> list[bool]:
+    """The episodes of some tasks, or all, and of all of a variant's seeds together."""
+    found = [measured(run, *report) or {} for run in runs_of(results, variant)]
+    return [
+        s for successes in found for task in tasks or successes for s in successes.get(task, [])
+    ]
+
+
 def pooled(results: dict, variant: str, report: tuple[str, int | str], tasks: list[str]) -> str:
-    """The episodes of some tasks and of all of a variant's seeds together."""
-    found = [measured(run, *report) for run in runs_of(results, variant)]
-    episodes = [s for successes in found if successes for task in tasks for s in successes[task]]
+    episodes = together(results, variant, report, tasks)
     return format_success(sum(episodes), len(episodes)) if episodes else ""
 
 
@@ -176,6 +190,24 @@ def variants_table(results: dict) -> str:
             rows.append([title, *(mean(results, variant, *column) for column in columns)])
     head = ["ML10", "base", "novel, no gradient step", "novel, 200 steps"]
     return format_table([head, *rows])
+
+
+def policies_table(results: dict) -> str:
+    """The paper's policies, without and with meta-training, beside what the paper has of them."""
+    columns = ("base", 0), ("novel", "after")
+    rows = [["ML10", *(f"{split}{how}" for split in TASKS for how in ("", " + MAML"))]]
+    rows[0] += [f"paper, {split}, without / with" for split in TASKS]
+    ours = {f"ml10-{key}": (f"ml10-{key}-maml", name) for key, name in POLICIES.items()}
+    for plain, (meta, name) in ({"ml10-no-inner-loop": ("ml10-dami", "DAMI")} | ours).items():
+        cells = [mean(results, v, *column) for column in columns for v in (plain, meta)]
+        theirs = [float(np.mean([PAPER[s][t][name] for t in TASKS[s]])) for s in TASKS]
+        if name == "DAMI":
+            cells += [f"- / {value:.1f}" for value in theirs]
+        else:
+            maml = PAPER["base_maml_avg"][name], np.mean(PAPER["novel_maml"][name])
+            cells += [f"{a:.1f} / {b:.1f}" for a, b in zip(theirs, maml)]
+        rows.append([name, *cells])
+    return format_table(rows)
 
 
 def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
@@ -221,6 +253,7 @@ TABLES = {
     "novel": by_task_table("novel"),
     "difficulty": difficulty_table,
     "variants": variants_table,
+    "policies": policies_table,
     "swap": swap_table,
     "reading": reading_table,
 }
@@ -270,11 +303,8 @@ def draw_adaptation(results: dict, path: Path) -> None:
     figure = Figure(figsize=(8, 3.8), layout="constrained")
     for axes, (label, points) in zip(figure.subplots(1, 2, sharey=True), panels.items()):
         for variant, title in VARIANTS.items():
-            curve = []
-            for run in runs_of(results, variant)[:1]:
-                curve = [(x, measured(run, report, column)) for x, report, column in points]
-            curve = [(x, [s for e in found.values() for s in e]) for x, found in curve if found]
-            if not curve:
+            curve = [(x, together(results, variant, report)) for x, *report in points]
+            if not (curve := [(x, episodes) for x, episodes in curve if episodes]):
                 continue
             bounds = [wilson_interval(sum(e), len(e)) for _, e in curve]
             rates = np.array([np.mean(e) for _, e in curve])

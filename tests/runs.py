@@ -53,7 +53,7 @@ REPORTS = {  # name -> command, of which variants (all: ()); {run} is the run's 
     "one-shot": ("evaluate.py --checkpoint {run} --split novel --without instruction", READS),
     "alone": ("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
 }
-# Along the adaptation, and with fewer demonstrations: 20 episodes, not told where that can be.
+# Along the adaptation, and with fewer demonstrations: 20 episodes.
 CURVE = {"curve": "--curve 1 5 20 50"}
 CURVE |= {f"{n}-shot": f"--demonstrations {n}" for n in (1, 3, 5)}
 for name, flags in CURVE.items():
@@ -92,8 +92,6 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
         out = Path(f"{run}-{name}")
         script, words = command.format(run=run).split(" ", 1)
         measured = f"{script} --episodes {episodes} {words} --seed {SEED} --workers 1 --out {out}"
-        if name in CURVE and variant in READS:
-            measured += " --no-instruction"
         listed.append(Job(f"{measured} --overwrite", out / "success.json", run.with_suffix(".log")))
     return listed
 

@@ -359,7 +359,8 @@ def test_an_unknown_or_contradictory_policy_is_refused_in_one_line(tmp_path):
 def test_dp3s_sampler_puts_back_the_prediction_and_another_can_be_chosen_at_a_checkpoint(tmp_path):
     scripts.save_checkpoint(tmp_path / "a.pt", new_policy("dp3"))
     (dp3, _), (plain, _) = (
-        scripts.load_checkpoint(tmp_path / "a.pt", sampler=s) for s in (None, "ddim")
+        scripts.load_checkpoint(tmp_path / "a.pt", **changed)
+        for changed in ({}, {"sampler": "ddim"})
     )
     assert (plain.config.sampler, dp3.config.sampler) == ("ddim", "dp3")
     batch = random_batch(plain)

@@ -169,8 +169,8 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(
 ):
     calls = []
 
-    def measured(checkpoint, paths, text, episodes, seed, workers, device, n, blank, sampler):
-        calls.append(({t: path.stem for t, path in paths.items()}, text, blank))
+    def measured(checkpoint, paths, text, episodes, seed, workers, device, n, blank, **changed):
+        calls.append(({t: path.stem for t, path in paths.items()}, text, blank, changed))
         return {task: [len(calls) == 1] * episodes for task in paths}
 
     monkeypatch.setattr(evaluate, "evaluate", measured)
@@ -187,11 +187,14 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(
         "instruction of another task",
     ]
     calls.clear()
-    without = "--without demonstration instruction --episodes 2 --out without"
+    without = "--without demonstration instruction --episodes 2 --out without --n-action-steps 4"
     evaluate.main(evaluating(run, recorded, without))
-    assert calls[0][2] and all(not text.any() for text in calls[0][1].values())
+    assert calls[0][2:] == (True, {"n_action_steps": 4}) and all(
+        not text.any() for text in calls[0][1].values()
+    )
     report = json.loads(Path("without/success.json").read_text())
     assert report["facts"]["without"] == "demonstration and instruction"
+    assert report["facts"]["n_action_steps"] == 4 and "sampler" not in report["facts"]
     assert "--swap needs" in fails(
         evaluate, evaluating(run, recorded, f"--task reach {swap}"), capsys
     )
