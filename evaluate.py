@@ -388,7 +388,7 @@ def evaluate(
         device: where the policy runs.
         n_demonstrations: use only the first so many of each file; None: all.
         blank: the policy sees zeros in place of its demonstration.
-        changed: of the policy's configuration, for the rollouts: sampler, n_action_steps.
+        changed: of the policy's configuration, for the rollouts, see `scripts.inference`.
 
     Returns:
         task -> E booleans, in the order of the episodes. They do not depend on `workers`.

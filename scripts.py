@@ -111,11 +111,12 @@ def add_inference_flags(add: Callable[..., Any]) -> None:
     """Adds the flags of what may be another in a rollout than in the training, see `inference`."""
     add("--sampler", choices=CHOICES["sampler"], help="DDIM as published, or as DP3 runs it")
     add("--n-action-steps", type=int, help="actions until the policy looks again")
+    add("--inference-steps", type=int, help="of the diffusion for each draw")
 
 
 def inference(args: argparse.Namespace) -> dict[str, Any]:
     """What was given of the flags of `add_inference_flags`, by the names of `PolicyConfig`."""
-    given = {name: getattr(args, name) for name in ("sampler", "n_action_steps")}
+    given = {name: getattr(args, name) for name in ("sampler", "n_action_steps", "inference_steps")}
     return {name: value for name, value in given.items() if value is not None}
 
 
