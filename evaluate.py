@@ -374,6 +374,7 @@ def evaluate(
     device: str | torch.device = "cpu",
     n_demonstrations: int | None = None,
     blank: bool = False,
+    known_goals: bool = False,
     **changed: Any,
 ) -> Successes:
     """Rolls a checkpoint out on Meta-World tasks in parallel processes.
@@ -388,23 +389,24 @@ def evaluate(
         device: where the policy runs.
         n_demonstrations: use only the first so many of each file; None: all.
         blank: the policy sees zeros in place of its demonstration.
+        known_goals: those of the demonstrations instead, at most `episodes` of them.
         changed: of the policy's configuration, for the rollouts, see `scripts.inference`.
 
     Returns:
         task -> E booleans, in the order of the episodes. They do not depend on `workers`.
     """
     at_least(1, episodes=episodes)
-    seeds = [evaluation_seed(seed, i) for i in range(episodes)]
-    chunks = [seeds[i : i + EPISODES_A_JOB] for i in range(0, episodes, EPISODES_A_JOB)]
-    jobs = [
-        (task, str(path), n_demonstrations, text[task].cpu().numpy(), chunk, blank)
-        for task, path in demonstrations.items()
-        for chunk in chunks
-    ]
+    jobs, total = [], 0
+    for task, path in demonstrations.items():
+        seeds = [evaluation_seed(seed, i) for i in range(episodes)]
+        if known_goals:
+            seeds = load_demonstrations(path).meta["episode_seeds"][:n_demonstrations][:episodes]
+        how = task, str(path), n_demonstrations, text[task].cpu().numpy()
+        starts = range(0, len(seeds), EPISODES_A_JOB)
+        jobs += [(*how, seeds[start : start + EPISODES_A_JOB], blank) for start in starts]
+        total += len(seeds)
     setup = (load_policy, str(checkpoint), str(device), changed)
-    found = run_jobs(
-        rollout_job, jobs, workers, len(demonstrations) * episodes, "evaluating", setup
-    )
+    found = run_jobs(rollout_job, jobs, workers, total, "evaluating", setup)
 
     results: Successes = {task: [] for task in demonstrations}
     for (task, *_), successes in zip(jobs, found):
@@ -691,6 +693,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     scripts.add_inference_flags(add)
     add("--without", **parts, help="leave these out: zeros in their place")
     add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
+    add("--known-goals", action="store_true", help="those of the demonstrations, not new ones")
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
     scripts.add_common_flags(add)
@@ -751,6 +754,8 @@ def main(argv: list[str] | None = None) -> None:
         print(f"{tasks[0]} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
     if args.swap and (len(tasks) < 2 or args.top):
         raise ValueError("--swap needs the tasks of a split, and the last checkpoint alone")
+    if args.swap and args.known_goals:
+        raise ValueError("--known-goals are those of a task's own demonstrations: leave out --swap")
     for checkpoint in labels:
         _, each = load_checkpoint(checkpoint, needs=TRAINED)
         if each["text_weights"] != info["text_weights"]:
@@ -775,6 +780,8 @@ def main(argv: list[str] | None = None) -> None:
         facts = {"title": " ".join(args.task or []) or f"{suite}, {args.split} tasks"}
         facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
         facts |= scripts.report_facts("evaluate.py", argv, device) | changed
+        if args.known_goals:
+            facts["goals"] = "of the demonstrations"
         if args.without:
             facts["without"] = " and ".join(args.without)
         if "instruction" in args.without:
@@ -794,7 +801,8 @@ def measure(
 ) -> None:
     """Rolls out the checkpoints of all runs (path -> label), and reports."""
     blank = "demonstration" in args.without
-    protocol = (args.episodes, args.seed, args.workers, device, args.demonstrations, blank)
+    protocol = args.episodes, args.seed, args.workers, device, args.demonstrations, blank
+    protocol += (args.known_goals,)
     changed = scripts.inference(args)
     results, swapped = {}, {}
     for checkpoint in labels:

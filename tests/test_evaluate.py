@@ -164,12 +164,24 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recorded
     assert len(alone) == 5 and np.array_equal(alone, later)
 
 
+def test_known_goals_are_those_of_the_demonstrations(run, recorded, monkeypatch, capsys):
+    jobs = []
+    monkeypatch.setattr(evaluate, "run_jobs", lambda job, given, *_: jobs.extend(given) or [])
+    paths, text = {"reach": recorded / "reach.npz"}, {"reach": torch.zeros(512)}
+    evaluate.evaluate(run / "ema-00006.pt", paths, text, episodes=20, known_goals=True)
+    known = data.load_demonstrations(paths["reach"]).meta["episode_seeds"]
+    assert [seed for *_, seeds, _ in jobs for seed in seeds] == known and len(known) < 20
+    assert "leave out --swap" in fails(
+        evaluate, evaluating(run, recorded, "--known-goals --swap instruction"), capsys
+    )
+
+
 def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(
     run, recorded, monkeypatch, capsys
 ):
     calls = []
 
-    def measured(checkpoint, paths, text, episodes, seed, workers, device, n, blank, **changed):
+    def measured(checkpoint, paths, text, episodes, seed, workers, device, n, blank, _, **changed):
         calls.append(({t: path.stem for t, path in paths.items()}, text, blank, changed))
         return {task: [len(calls) == 1] * episodes for task in paths}
 
