@@ -48,13 +48,13 @@ DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022)
 }
 VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-dami": "DAMI",
-    "ml10-inner-3e-2": "DAMI with an inner rate of 3e-2",
+    "ml10-inner-3e-2": "DAMI with an inner rate of 3e-2, executing eight actions",
     "ml10-no-inner-loop": "without the inner loop",
     "ml10-no-inner-loop-cpu": "without the inner loop, trained on two cores",
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
     "ml10-scratch": "from random weights",
-    "before": "until 2026-11-23: the instruction always told, inner rate 1e-4, DDIM",
+    "before": "until 2026-11-23: instruction always told, inner rate 1e-4, DDIM, executing eight",
     "before-no-inner-loop": "until 2026-11-23, without the inner loop",
 }
 SWAPPED = {  # a run -> its panel in the swap chart
