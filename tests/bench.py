@@ -350,14 +350,17 @@ def policies_table(recorded: Demonstrations, device: torch.device, repeat: int) 
             (policy, "multi-task step"): lambda bench=bench, batches=batches: multi_task_gradient(
                 bench.policy, batches
             ),
+            (policy, "in bfloat16"): lambda bench=bench, batches=batches: multi_task_gradient(
+                bench.policy, batches, bfloat16=True
+            ),
             (policy, "second order"): lambda bench=bench, batches=batches: bench.outer_step(
                 batches, first_order=False
             ),
             (policy, "control step"): bench.control(),
         }
     ms = medians(calls, repeat)
-    print("\n| `small`, ms | multi-task step | second order | control step | of so many actions |")
-    print("|---|---|---|---|---|")
+    steps = "multi-task step | in bfloat16 | second order | control step | of so many actions"
+    print(f"\n| `small`, ms | {steps} |\n|---|---|---|---|---|---|")
     for policy, n in actions.items():
         cells = [f"{value:.0f}" for (name, _), value in ms.items() if name == policy]
         print(f"| {policy} | {' | '.join(cells)} | {n} |", flush=True)

@@ -62,12 +62,6 @@ SWAPPED = {  # a run -> its panel in the swap chart
     "ml10-dami-seed0": "DAMI, seed 0",
     "ml10-no-inner-loop-cpu-seed0": "what ships",
 }
-POLICIES = {  # of baselines.py -> what the paper calls it
-    "dp3": "DP3",
-    "flow": "FlowPolicy",
-    "mamba": "Mamba",
-    "freq": "FreqPolicy",
-}
 SHOWN = {"ml10-dami": "DAMI", "ml10-no-inner-loop": "no inner loop", "ml10-neither": "multi-task"}
 
 
@@ -192,24 +186,6 @@ def variants_table(results: dict) -> str:
     return format_table([head, *rows])
 
 
-def policies_table(results: dict) -> str:
-    """The paper's policies, without and with meta-training, beside what the paper has of them."""
-    columns = ("base", 0), ("novel", "after")
-    rows = [["ML10", *(f"{split}{how}" for split in TASKS for how in ("", " + MAML"))]]
-    rows[0] += [f"paper, {split}, without / with" for split in TASKS]
-    ours = {f"ml10-{key}": (f"ml10-{key}-maml", name) for key, name in POLICIES.items()}
-    for plain, (meta, name) in ({"ml10-no-inner-loop": ("ml10-dami", "DAMI")} | ours).items():
-        cells = [mean(results, v, *column) for column in columns for v in (plain, meta)]
-        theirs = [float(np.mean([PAPER[s][t][name] for t in TASKS[s]])) for s in TASKS]
-        if name == "DAMI":
-            cells += [f"- / {value:.1f}" for value in theirs]
-        else:
-            maml = PAPER["base_maml_avg"][name], np.mean(PAPER["novel_maml"][name])
-            cells += [f"{a:.1f} / {b:.1f}" for a, b in zip(theirs, maml)]
-        rows.append([name, *cells])
-    return format_table(rows)
-
-
 def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
     """Policy -> what it is shown, and its episodes on the base tasks."""
     found = {}
@@ -253,7 +229,6 @@ TABLES = {
     "novel": by_task_table("novel"),
     "difficulty": difficulty_table,
     "variants": variants_table,
-    "policies": policies_table,
     "swap": swap_table,
     "reading": reading_table,
 }

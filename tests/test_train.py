@@ -114,6 +114,23 @@ def test_a_share_of_the_batches_sees_no_instruction_and_of_inner_steps_nothing(r
 # ---- Whole runs ----------------------------------------------------------------------------------
 
 
+def test_products_in_bfloat16_leave_nearly_the_same_gradient(recorded):
+    torch.manual_seed(0)
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    demonstrations = data.load_demonstrations(recorded / "reach.npz")
+    sampler, text = data.WindowSampler(demonstrations, policy.config), torch.randn(512)
+    policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
+    batches = [
+        train.task_batch(policy, sampler, text, 12, (0, 0, k), train.Settings()) for k in range(4)
+    ]
+    whole, half = (
+        torch.cat([g.flatten() for g in train.multi_task_gradient(policy, batches, b)[0].values()])
+        for b in (False, True)
+    )
+    assert half.dtype == torch.float32 and not torch.equal(whole, half)
+    assert torch.cosine_similarity(whole, half, dim=0) > 0.99
+
+
 def test_training_leaves_everything_that_it_promises(run):
     names = "config.json curves.png ema-00003.pt ema-00006.pt last.pt metrics.jsonl"
     names += " success.json success.md success.png"
