@@ -12,6 +12,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from evaluate import (
     pooled_success,
     wilson_interval,
 )
+from model import PRESETS
 from scripts import format_table, load_checkpoint, save_checkpoint
 from simulator import suite_tasks
 from tests.runs import REPORTS
@@ -311,8 +313,10 @@ def draw_by_task(results: dict, path: Path) -> None:
 
 
 def ship(checkpoint: str) -> None:
-    """Writes assets/ml10-small.pt: a checkpoint of train.py, its weights as float16."""
-    policy, info = load_checkpoint(checkpoint)
+    """Writes assets/ml10-small.pt: a checkpoint in float16 that is rolled out as `small` is."""
+    small = asdict(PRESETS["small"])
+    changed = {name: small[name] for name in ("n_action_steps", "inference_steps")}
+    policy, info = load_checkpoint(checkpoint, **changed)
     kept = {name: info[name] for name in TRAINED}
     save_checkpoint(SHIPPED_CHECKPOINT, policy, half=True, **kept)
 
