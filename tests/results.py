@@ -55,7 +55,8 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-no-inner-loop-cpu": "without the inner loop, trained on two cores",
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
-    "ml10-scratch": "from random weights",
+    "ml10-30-demonstrations": "multi-task training, thirty demonstrations a task",
+    "ml10-scratch": "from random weights, executing eight actions",
     "before": "until 2026-11-23: instruction always told, inner rate 1e-4, DDIM, executing eight",
     "before-no-inner-loop": "until 2026-11-23, without the inner loop",
 }

@@ -26,6 +26,7 @@ VARIANTS = {
     "no-inner-loop": "--maml off",
     "no-demonstration": "--demo-encoder none",
     "neither": "--demo-encoder none --maml off",
+    "30-demonstrations": "--demo-encoder none --maml off --demonstrations 30 --data data30",
     "first-order": "--maml first",
     "inner-3e-2": "--inner-lr 3e-2",
     "no-dropout": "--instruction-dropout 0",

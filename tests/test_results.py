@@ -39,10 +39,11 @@ def test_runs_are_of_the_variants_that_they_name():
         arguments, config = run["training"]["arguments"], run["training"]["config"]
         steps = 1 if variant == "scratch" else 10_000
         assert arguments["seed"] == int(seed) and arguments["steps"] == steps
-        off = variant.endswith("inner-loop") or variant in ("neither", "scratch")
+        multi_task = variant in ("neither", "30-demonstrations")
+        off = variant.endswith("inner-loop") or multi_task or variant == "scratch"
         assert (arguments["maml"] == "off") == off
         silent = config["demo_encoder"] == "none"
-        assert silent == (variant in ("no-demonstration", "neither"))
+        assert silent == (multi_task or variant == "no-demonstration")
         always_told = arguments.get("instruction_dropout", 0) == 0
         assert always_told == (variant.startswith("before") or silent)
         assert variant in VARIANTS or variant.startswith("before")
