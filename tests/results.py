@@ -50,14 +50,14 @@ DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022)
 }
 VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-dami": "DAMI",
-    "ml10-inner-3e-2": "DAMI with an inner rate of 3e-2, executing eight actions",
+    "ml10-inner-3e-2": "DAMI with an inner rate of 3e-2",
     "ml10-no-inner-loop": "without the inner loop",
     "ml10-no-inner-loop-cpu": "without the inner loop, trained on two cores",
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
-    "ml10-30-demonstrations": "multi-task training, thirty demonstrations a task",
-    "ml10-scratch": "from random weights, executing eight actions",
-    "before": "until 2026-11-23: instruction always told, inner rate 1e-4, DDIM, executing eight",
+    "ml10-30-demonstrations": "multi-task training, thirty demonstrations, four executed actions",
+    "ml10-scratch": "from random weights",
+    "before": "until 2026-11-23: the instruction always told, inner rate 1e-4, DDIM",
     "before-no-inner-loop": "until 2026-11-23, without the inner loop",
 }
 SWAPPED = {  # a run -> its panel in the swap chart
@@ -216,6 +216,19 @@ def reading_table(results: dict) -> str:
     return format_table(rows)
 
 
+def looks_table(results: dict) -> str:
+    """A row a run that was also rolled out with four actions of five steps for eight of ten."""
+    columns = ("base", 0), ("novel", "after")
+    rows = [["run", *(f"{split}, {n}" for split, _ in columns for n in ("8 of 10", "4 of 5"))]]
+    for variant, title in VARIANTS.items():
+        for name in (name for name in sorted(results) if name.rsplit("-seed")[0] == variant):
+            if again := results.get(name.replace("-seed", "-four-seed")):
+                found = [measured(run, *c) for c in columns for run in (results[name], again)]
+                cells = [pooled_success(successes) if successes else "" for successes in found]
+                rows.append([f"{title}, seed {name[-1]}", *cells])
+    return format_table(rows)
+
+
 def swap_table(results: dict) -> str:
     rows = {}
     policies = swaps(results)
@@ -232,6 +245,7 @@ TABLES = {
     "novel": by_task_table("novel"),
     "difficulty": difficulty_table,
     "variants": variants_table,
+    "looks": looks_table,
     "swap": swap_table,
     "reading": reading_table,
 }

@@ -35,7 +35,7 @@ def test_a_cell_can_be_recomputed_from_the_episodes(report, column, task):
 def test_runs_are_of_the_variants_that_they_name():
     for name, run in HELD.items():
         variant, seed = re.fullmatch(r"(?:ml10-)?(.*)-seed(\d)", name).groups()
-        variant = variant.removesuffix("-cpu")
+        variant = variant.removesuffix("-cpu").removesuffix("-four")
         arguments, config = run["training"]["arguments"], run["training"]["config"]
         steps = 1 if variant == "scratch" else 10_000
         assert arguments["seed"] == int(seed) and arguments["steps"] == steps
