@@ -55,7 +55,10 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-no-inner-loop-cpu": "without the inner loop, trained on two cores",
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
-    "ml10-30-demonstrations": "multi-task training, thirty demonstrations, four executed actions",
+    "ml10-dami-four": "four executed actions of five steps: DAMI",
+    "ml10-no-inner-loop-four": "four executed actions: without the inner loop",
+    "ml10-neither-four": "four executed actions: multi-task training",
+    "ml10-30-demonstrations": "four executed actions: multi-task training, thirty demonstrations",
     "ml10-scratch": "from random weights",
     "before": "until 2026-11-23: the instruction always told, inner rate 1e-4, DDIM",
     "before-no-inner-loop": "until 2026-11-23, without the inner loop",
@@ -222,8 +225,9 @@ def looks_table(results: dict) -> str:
     rows = [["run", *(f"{split}, {n}" for split, _ in columns for n in ("8 of 10", "4 of 5"))]]
     for variant, title in VARIANTS.items():
         for name in (name for name in sorted(results) if name.rsplit("-seed")[0] == variant):
-            if again := results.get(name.replace("-seed", "-four-seed")):
-                found = [measured(run, *c) for c in columns for run in (results[name], again)]
+            run, again = results[name], results.get(name.replace("-seed", "-four-seed"))
+            if again and again["training"] == run["training"]:
+                found = [measured(each, *c) for c in columns for each in (run, again)]
                 cells = [pooled_success(successes) if successes else "" for successes in found]
                 rows.append([f"{title}, seed {name[-1]}", *cells])
     return format_table(rows)
