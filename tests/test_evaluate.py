@@ -157,7 +157,7 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recorded
         evaluate.rollout_job(task, str(recorded / f"{task}.npz"), 2, text, seeds)
         return np.stack(frames)
 
-    evaluate.load_policy(str(run / "ema-00006.pt"), "cpu")
+    evaluate.load_policy(str(run / "ema-00006.pt"), "cpu", {})
     alone = job("reach", 1)
     for task, episode in [("reach", 0), ("drawer-close", 0), ("reach", 1)]:
         later = job(task, episode)
