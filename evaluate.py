@@ -781,7 +781,7 @@ def main(argv: list[str] | None = None) -> None:
         facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
         facts |= scripts.report_facts("evaluate.py", argv, device) | changed
         if args.known_goals:
-            facts["goals"] = "of the demonstrations"
+            facts["goals"] = "of the demonstrations, each once"
         if args.without:
             facts["without"] = " and ".join(args.without)
         if "instruction" in args.without:

@@ -492,7 +492,7 @@ Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None:
 
 
 class DAMIPolicy(nn.Module):
-    """The policy: two observations, an instruction and a demonstration in; eight actions out."""
+    """The policy: two observations, an instruction and a demonstration in; actions out."""
 
     demo_encoders: ClassVar = {"vmt": VisualMotorTrajectory}  # baselines.py exchanges both
     network = ConditionalUNet1d

@@ -137,10 +137,13 @@ def split(batch: dict[str, Tensor], n: int) -> tuple[dict[str, Tensor], dict[str
 def multi_task_gradient(
     policy: DAMIPolicy, batches: list[dict[str, Tensor]], bfloat16: bool = False
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """The gradient of ordinary multi-task training: all windows of all tasks, no inner step."""
-    if len({batch["demo_points"].shape for batch in batches}) == 1:
+    """The gradient of ordinary multi-task training: all windows of all tasks, no inner step.
+
+    `batches` are of `task_batch`, one a task. With `bfloat16` matrix products and convolutions are
+    computed in it, and the gradient stays float32. Returns parameter name -> gradient, loss (1,).
+    """
+    if len({batch["demo_points"].shape for batch in batches}) == 1:  # else: of different lengths
         batches = [{name: torch.cat([b[name] for b in batches]) for name in batches[0]}]
-    # else demonstrations of different lengths
     with torch.autocast(batches[0]["action"].device.type, torch.bfloat16, enabled=bfloat16):
         loss = torch.stack([policy.loss(**batch) for batch in batches]).mean()
     parameters = dict(policy.named_parameters())

@@ -164,6 +164,7 @@ def together(
 
 
 def pooled(results: dict, variant: str, report: tuple[str, int | str], tasks: list[str]) -> str:
+    """Their share of successes."""
     episodes = together(results, variant, report, tasks)
     return format_success(sum(episodes), len(episodes)) if episodes else ""
 
@@ -223,13 +224,11 @@ def looks_table(results: dict) -> str:
     """A row a run that was also rolled out with four actions of five steps for eight of ten."""
     columns = ("base", 0), ("novel", "after")
     rows = [["run", *(f"{split}, {n}" for split, _ in columns for n in ("8 of 10", "4 of 5"))]]
-    for variant, title in VARIANTS.items():
-        for name in (name for name in sorted(results) if name.rsplit("-seed")[0] == variant):
-            run, again = results[name], results.get(name.replace("-seed", "-four-seed"))
-            if again and again["training"] == run["training"]:
-                found = [measured(each, *c) for c in columns for each in (run, again)]
-                cells = [pooled_success(successes) if successes else "" for successes in found]
-                rows.append([f"{title}, seed {name[-1]}", *cells])
+    for name, run in sorted(results.items()):
+        again = results.get(name.replace("-seed", "-four-seed"))
+        if again and again["training"] == run["training"]:
+            cells = [pooled_success(measured(r, *c)) for c in columns for r in (run, again)]
+            rows.append([f"{VARIANTS[name.rsplit('-seed')[0]]}, seed {name[-1]}", *cells])
     return format_table(rows)
 
 

@@ -43,10 +43,10 @@ def test_a_bit_that_makes_a_tensor_a_folder_to_torch_is_noticed(tmp_path):
         scripts.load_checkpoint(path)
 
 
-def test_ten_kills_at_random_times_change_no_bit(run, recorded, small_suite, tmp_path):
+def test_twenty_kills_at_random_times_change_no_bit(run, recorded, small_suite, tmp_path):
     """In forks, which need not import anything; saved so often that each kill finds another."""
     rng, kills, runs = random.Random(0), 0, 0
-    while kills < 10:
+    while kills < 20:
         out, runs, code = tmp_path / f"run{runs}", runs + 1, None
         while code != 0:
             argv = [*FEW, "--data", str(recorded), "--out", str(out)]
@@ -58,7 +58,7 @@ def test_ten_kills_at_random_times_change_no_bit(run, recorded, small_suite, tmp
                     scripts.command_line(lambda argv=argv: train.main(argv))
                     code = 0
                 os._exit(code)
-            if kills < 10:  # after that it may end, however slow the machine is
+            if kills < 20:  # after that it may end, however slow the machine is
                 time.sleep(rng.uniform(0.1, 0.8))
                 with suppress(ProcessLookupError):
                     os.kill(child, rng.choice(fuzz.SIGNALS))
