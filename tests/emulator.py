@@ -478,6 +478,11 @@ class Emulator:
                     elif len(batch) >= self.faults.joined:
                         connection.sendall(b"".join(batch))
                         batch = []
+            if self.faults.drop:  # in order: closed with packages unread it would be reset instead
+                connection.shutdown(socket.SHUT_WR)
+                connection.settimeout(1)
+                while connection.recv(65536):
+                    pass
         finally:
             with self.lock:
                 self.owners = {name: owner for name, owner in self.owners.items() if owner != me}
