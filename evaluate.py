@@ -282,13 +282,14 @@ def action_error(
     newest, Ta = policy.config.n_obs_steps - 1, policy.config.n_action_steps
     for episode in range(len(unseen.episodes)):
         demo = shown.demonstration(shown.draw_episode(generator))
-        context = policy.encode_demo(text[None], **demo)
+        context = policy.encode_demo(text[None], **{k: x.to(text.device) for k, x in demo.items()})
         windows = unseen.gather((unseen.episode_of == episode).nonzero()[::Ta, 0])
+        windows = {name: x.to(text.device) for name, x in windows.items()}
         done = windows["action"][:, newest : newest + Ta]  # (n, Ta, A)
         seen = windows["points"], windows["state"]
         drawn = policy.sample_actions(*seen, context, generator)  # (n, Ta, A)
         errors.append((drawn - done).abs().flatten())
-        plain.append((shown.action.mean(dim=0) - done).abs().flatten())
+        plain.append((shown.action.mean(dim=0).to(text.device) - done).abs().flatten())
     return torch.cat(errors).mean().item(), torch.cat(plain).mean().item()
 
 

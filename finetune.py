@@ -67,7 +67,7 @@ def adapt_policy(
 
     Args:
         policy: the meta-trained (EMA) policy; it is left as it is.
-        sampler: of the task's demonstrations, on the policy's device.
+        sampler: of the task's demonstrations.
         text: instruction feature, (text_dim,).
         steps, batch: gradient steps, and windows in each.
         learning_rates: of the parameter groups `vision`, `diffusion` and `other`.
@@ -84,15 +84,24 @@ def adapt_policy(
     optimizer = torch.optim.AdamW(groups, betas=(0.95, 0.999), weight_decay=1e-6, fused=True)
     generator = torch.Generator().manual_seed(seed)
 
+    def loss_and_gradient(drawn: dict[str, Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
+        loss = adapted.loss(text=text[None], **drawn)  # lines 8 to 14
+        return loss.detach(), torch.autograd.grad(loss, list(adapted.parameters()))
+
+    lengths = {episode.stop - episode.start for episode in sampler.episodes}
+    if text.is_cuda and len(lengths) == 1:  # each step has the same shapes
+        loss_and_gradient = scripts.Captured(loss_and_gradient)
+
     for step in range(1, steps + 1):  # line 6
-        windows = sampler.batch(batch, generator)  # line 7
-        noise = adapted.draw_noise_and_timesteps(batch, generator)  # line 10
-        loss = adapted.loss(text=text[None], **windows, **noise)  # lines 8 to 14
+        drawn = sampler.batch(batch, generator)  # line 7
+        drawn |= adapted.draw_noise_and_timesteps(batch, generator)  # line 10
+        drawn = {name: x.to(text.device) for name, x in drawn.items()}
+        loss, gradient = loss_and_gradient(drawn)
         if not torch.isfinite(loss):
             raise ValueError(f"{sampler.task}: loss not finite at step {step}, lower the --lr-...")
 
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        for parameter, g in zip(adapted.parameters(), gradient):
+            parameter.grad = g
         torch.nn.utils.clip_grad_norm_(adapted.parameters(), 1.0)
         optimizer.step()  # line 15
         average.update_parameters(adapted)  # line 16
@@ -120,8 +129,8 @@ def adapt_checkpoint(
     """
     policy, info = load_checkpoint(checkpoint, text.device, evaluate.TRAINED, **changed)
     demonstrations = load_demonstrations(data).take(settings.demonstrations)
-    trained, device, task = info["arguments"], text.device, demonstrations.task
-    how = policy.config, device, trained.get("after_success")
+    trained, task = info["arguments"], demonstrations.task
+    how = policy.config, "cpu", trained.get("after_success")
     parts = evaluate.hold_out({task: demonstrations}, settings.held_out)
     shown, unseen = (scripts.windows(part, *how) for part in parts)
     sampler, judged_by = shown[task], (shown, unseen, {task: text})

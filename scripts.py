@@ -37,6 +37,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from torch.optim.swa_utils import AveragedModel
+from torch.utils._pytree import tree_leaves, tree_map
 from tqdm import tqdm
 
 from baselines import PRESETS, build_policy
@@ -214,6 +215,8 @@ def pick_device(name: str | None) -> torch.device:
         raise ValueError(
             f"--device {name} cannot be used here ({reason}): use --device cpu"
         ) from error
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")  # TF32, as PyTorch has convolutions anyway
     return device
 
 
@@ -540,6 +543,32 @@ def remove_temporaries(folder: Path) -> None:
 def write_text(path: Path, text: str) -> None:
     """Writes a text file, atomically."""
     write_atomically(path, lambda temporary: temporary.write_text(text))
+
+
+class Captured:
+    """A function of tensors as one CUDA graph: Python starts it at once, not kernel by kernel.
+
+    The first call records it, on copies of what it is given. Each call copies what it is given over
+    those, in the same shapes, and runs the recording. What the function reads besides, such as
+    weights, must stay in its place in memory; what it returns holds until the next call.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function, self.inputs = function, None
+
+    def __call__(self, *inputs: Any) -> Any:
+        if self.inputs is None:
+            self.inputs = tree_map(torch.clone, inputs)
+            self.graph, aside = torch.cuda.CUDAGraph(), torch.cuda.Stream()
+            aside.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(aside):
+                self.function(*self.inputs)  # libraries prepare themselves at their first call
+            torch.cuda.current_stream().wait_stream(aside)
+            with torch.cuda.graph(self.graph):
+                self.outputs = self.function(*self.inputs)
+        torch._foreach_copy_(tree_leaves(self.inputs), tree_leaves(inputs))
+        self.graph.replay()
+        return self.outputs
 
 
 def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int, int]:

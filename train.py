@@ -124,7 +124,8 @@ def task_batch(
         windows |= {name: torch.zeros_like(windows[name]) for name in shown}
     if hide or drop < settings.instruction_dropout:
         text = torch.zeros_like(text)
-    return {"text": text[None], **windows, **policy.draw_noise_and_timesteps(n, generator)}
+    drawn = {"text": text[None], **windows, **policy.draw_noise_and_timesteps(n, generator)}
+    return {name: x.to(text.device) for name, x in drawn.items()}
 
 
 def split(batch: dict[str, Tensor], n: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -215,22 +216,27 @@ def meta_train(
     def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         return functional_call(policy, params, (), batch)
 
+    def without_inner_step(batches: list[dict[str, Tensor]]) -> tuple:
+        return *multi_task_gradient(policy, batches, settings.bfloat16), {}
+
+    def through_inner_step(batches: list[dict[str, Tensor]]) -> tuple:  # lines 4 to 19
+        pairs = [split(batch, settings.support) for batch in batches]
+        gradients, losses, before = meta_gradient(loss_fn, params, pairs, **how)
+        return gradients, losses, {"loss_before": before.mean()}
+
+    if next(policy.parameters()).is_cuda and len(lengths) == 1:  # each step has the same shapes
+        without_inner_step = scripts.Captured(without_inner_step)
+        through_inner_step = scripts.Captured(through_inner_step)
+
     for step in range(start, settings.steps):  # lines 2, 22
-        # A generator: the inner loop below keeps the batches of `at_once` tasks in memory, not all.
         inner = step >= multi_task_steps
-        batches = (  # lines 3 to 6, 9
+        batches = [  # lines 3 to 6, 9
             task_batch(policy, samplers[t], text[t], n, (seed, step, i), settings, inner)
             for i, t in my_tasks
-        )
+        ]
 
         # The gradient of the mean loss over my tasks
-        if not inner:
-            gradients, losses = multi_task_gradient(policy, list(batches), settings.bfloat16)
-            figures = {}
-        else:  # lines 4 to 19: the inner step on support, the gradient of the query loss through it
-            pairs = (split(batch, settings.support) for batch in batches)
-            gradients, losses, before = meta_gradient(loss_fn, params, pairs, **how)
-            figures = {"loss_before": before.mean().item()}
+        gradients, losses, figures = (through_inner_step if inner else without_inner_step)(batches)
         loss = losses.mean()
 
         # The mean over all tasks: the processes' means, weighted by their shares
@@ -250,7 +256,8 @@ def meta_train(
         optimizer.param_groups[0]["lr"] = learning_rate(step, settings)
         optimizer.step()  # line 20
         ema.update_parameters(policy)  # line 21
-        yield step + 1, figures | {"loss": loss.item(), "gradient_norm": norm.item()}
+        figures = figures | {"loss": loss, "gradient_norm": norm}
+        yield step + 1, {name: x.item() for name, x in figures.items()}
 
 
 # ---- Command line --------------------------------------------------------------------------------
@@ -324,7 +331,7 @@ def run(
     config = scripts.choose_config(args, settings.preset, recorded, settings.suite == "own")
 
     recorded, held = evaluate.hold_out(recorded, settings.held_out)
-    how = (config, device, rest, settings.augment)
+    how = (config, "cpu", rest, settings.augment)  # drawn there, whatever computes
     shown = n and n - settings.held_out  # demonstrations for rollouts
     samplers, unseen = (scripts.windows(part, *how) for part in (recorded, held))
     policy, ema, optimizer = initialize(config, settings, samplers, device)
