@@ -89,7 +89,7 @@ def adapt_policy(
         return loss.detach(), torch.autograd.grad(loss, list(adapted.parameters()))
 
     lengths = {episode.stop - episode.start for episode in sampler.episodes}
-    if text.is_cuda and len(lengths) == 1:  # each step has the same shapes
+    if text.is_cuda and len(lengths) == 1:  # always equal shapes
         loss_and_gradient = scripts.Captured(loss_and_gradient)
 
     for step in range(1, steps + 1):  # line 6

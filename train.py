@@ -224,7 +224,7 @@ def meta_train(
         gradients, losses, before = meta_gradient(loss_fn, params, pairs, **how)
         return gradients, losses, {"loss_before": before.mean()}
 
-    if next(policy.parameters()).is_cuda and len(lengths) == 1:  # each step has the same shapes
+    if next(policy.parameters()).is_cuda and world == len(lengths) == 1:  # always equal shapes
         without_inner_step = scripts.Captured(without_inner_step)
         through_inner_step = scripts.Captured(through_inner_step)
 

@@ -36,31 +36,27 @@ from tests.runs import REPORTS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "RESULTS.json"
-PAPER = json.loads((ROOT / "assets" / "paper_results.json").read_text())["ml10"]
-BASE, NOVEL = suite_tasks("ml10")
-TASKS = {"base": BASE, "novel": NOVEL}
-DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022)
-    "easy": [
-        *("reach", "door-open", "drawer-close", "button-press-topdown", "window-open"),
-        *("drawer-open", "door-close", "lever-pull"),
-    ],
-    "medium": ["peg-insert-side", "sweep", "basketball", "sweep-into"],
-    "hard": ["push", "pick-place"],
-    "very hard": ["shelf-place"],
+PAPER = json.loads((ROOT / "assets" / "paper_results.json").read_text())
+TASKS = {suite: dict(zip(("base", "novel"), suite_tasks(suite))) for suite in ("ml10", "ml45")}
+DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022); the others are easy
+    "medium": "basketball bin-picking box-close coffee-pull coffee-push hammer peg-insert-side "
+    "push-wall soccer sweep sweep-into",
+    "hard": "assembly hand-insert pick-out-of-hole pick-place push push-back",
+    "very hard": "disassemble pick-place-wall shelf-place stick-pull stick-push",
 }
 VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-dami": "DAMI",
-    "ml10-inner-3e-2": "DAMI with an inner rate of 3e-2",
     "ml10-no-inner-loop": "without the inner loop",
     "ml10-no-inner-loop-cpu": "without the inner loop, trained on two cores",
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
-    "ml10-dami-four": "four executed actions of five steps: DAMI",
-    "ml10-no-inner-loop-four": "four executed actions: without the inner loop",
-    "ml10-neither-four": "four executed actions: multi-task training",
-    "ml10-30-demonstrations": "four executed actions: multi-task training, thirty demonstrations",
+    "ml10-30-demonstrations": "multi-task training, thirty demonstrations",
     "ml10-scratch": "from random weights",
-    "before": "until 2026-11-23: the instruction always told, inner rate 1e-4, DDIM",
+    "ml10-dami-eight": "eight actions of ten steps: DAMI",
+    "ml10-inner-3e-2": "eight actions of ten steps: DAMI with an inner rate of 3e-2",
+    "ml10-no-inner-loop-eight": "eight actions of ten steps: without the inner loop",
+    "ml10-neither-eight": "eight actions of ten steps: multi-task training",
+    "before": "until 2026-11-23: the instruction always told, inner rate 1e-4, DDIM, eight of ten",
     "before-no-inner-loop": "until 2026-11-23, without the inner loop",
 }
 SWAPPED = {  # a run -> its panel in the swap chart
@@ -68,7 +64,16 @@ SWAPPED = {  # a run -> its panel in the swap chart
     "ml10-dami-seed0": "DAMI, seed 0",
     "ml10-no-inner-loop-cpu-seed0": "what ships",
 }
-SHOWN = {"ml10-dami": "DAMI", "ml10-no-inner-loop": "no inner loop", "ml10-neither": "multi-task"}
+POLICIES = {  # of baselines.py -> what the paper calls it
+    "dp3": "DP3",
+    "flow": "FlowPolicy",
+    "mamba": "Mamba",
+    "freq": "FreqPolicy",
+}
+COLUMNS = {"dami": "DAMI", "no-inner-loop": "no inner loop", "neither": "multi-task"}
+SHOWN = {suite: {f"{suite}-{v}": title for v, title in COLUMNS.items()} for suite in TASKS}
+SHOWN["ml45"]["ml45-dp3"] = "DP3"
+REPORT = {"base": ("base", 0), "novel": ("novel", "after")}  # what measures the tasks of a split
 
 
 def take(results: dict, run: Path) -> None:
@@ -118,37 +123,40 @@ def mean(results: dict, variant: str, report: str, column: int | str = 0) -> str
     return f"{pooled_success(found[0])} (one run)"
 
 
-def papers(split: str, tasks: list[str]) -> list[str]:
+def papers(suite: str, split: str, tasks: list[str]) -> list[str]:
     """The paper's success of DP3 and of DAMI, the mean over some tasks."""
-    return [f"{np.mean([PAPER[split][t][name] for t in tasks]):.1f}" for name in ("DP3", "DAMI")]
+    theirs = PAPER[suite][split]
+    return [f"{np.mean([theirs[t][name] for t in tasks]):.1f}" for name in ("DP3", "DAMI")]
 
 
-def means_table(results: dict) -> str:
+def head(suite: str, title: str) -> list[str]:
+    return [title, *SHOWN[suite].values(), "paper, DP3", "paper, DAMI"]
+
+
+def means_table(results: dict, suite: str = "ml10") -> str:
     """The means of DAMI, without its inner loop, of multi-task training, and the paper's."""
-    shown = {
-        "base tasks": ("base", 0, "base"),
-        "novel tasks, no gradient step": ("novel", "before", ""),
-        "novel tasks, 200 steps": ("novel", "after", "novel"),
-    }
-    rows = []
-    for title, (report, column, split) in shown.items():
-        theirs = papers(split, TASKS[split]) if split else ["", ""]
-        rows.append([title, *(mean(results, v, report, column) for v in SHOWN), *theirs])
-    return format_table([["ML10", *SHOWN.values(), "paper, DP3", "paper, DAMI"], *rows])
+    tasks = TASKS[suite]
+    rows = [
+        ["base tasks", REPORT["base"], papers(suite, "base", tasks["base"])],
+        ["novel tasks, no gradient step", ("novel", "before"), ["", ""]],
+        ["novel tasks, 200 steps", REPORT["novel"], papers(suite, "novel", tasks["novel"])],
+    ]
+    shown = SHOWN[suite]
+    rows = [[t, *(mean(results, v, *report) for v in shown), *theirs] for t, report, theirs in rows]
+    return format_table([head(suite, suite.upper()), *rows])
 
 
-def by_task_table(split: str) -> Callable[[dict], str]:
+def by_task_table(split: str, suite: str = "ml10") -> Callable[[dict], str]:
     """A row a task: each variant's seeds together, and the paper's."""
-    report = ("base", 0) if split == "base" else ("novel", "after")
 
     def make(results: dict) -> str:
-        rows = []
-        for task in TASKS[split]:
-            cells = [pooled(results, variant, report, [task]) for variant in SHOWN]
-            rows.append([task, *cells, *papers(split, [task])])
-        means = [mean(results, variant, *report) for variant in SHOWN]
-        rows.append(["**mean**", *means, *papers(split, TASKS[split])])
-        return format_table([["task", *SHOWN.values(), "paper, DP3", "paper, DAMI"], *rows])
+        rows, tasks, shown = [], TASKS[suite][split], SHOWN[suite]
+        for task in tasks:
+            cells = [pooled(results, variant, REPORT[split], [task]) for variant in shown]
+            rows.append([task, *cells, *papers(suite, split, [task])])
+        means = [mean(results, variant, *REPORT[split]) for variant in shown]
+        rows.append(["**mean**", *means, *papers(suite, split, tasks)])
+        return format_table([head(suite, "task"), *rows])
 
     return make
 
@@ -169,28 +177,46 @@ def pooled(results: dict, variant: str, report: tuple[str, int | str], tasks: li
     return format_success(sum(episodes), len(episodes)) if episodes else ""
 
 
-def difficulty_table(results: dict) -> str:
+def difficulty_table(results: dict, suite: str = "ml10") -> str:
     """A row for the base tasks, and one for the novel tasks, of each difficulty."""
-    rows = []
-    for split, report in (("base", ("base", 0)), ("novel", ("novel", "after"))):
-        for difficulty, members in DIFFICULTY.items():
-            if not (tasks := [task for task in TASKS[split] if task in members]):
-                continue
-            cells = [pooled(results, variant, report, tasks) for variant in SHOWN]
-            title = f"{split}, {difficulty} ({len(tasks)})"
-            rows.append([title, *cells, *papers(split, tasks)])
-    return format_table([["tasks", *SHOWN.values(), "paper, DP3", "paper, DAMI"], *rows])
+    rows, of = [], {task: name for name, tasks in DIFFICULTY.items() for task in tasks.split()}
+    for split, report in REPORT.items():
+        for difficulty in ("easy", *DIFFICULTY):
+            tasks = [t for t in TASKS[suite][split] if of.get(t, "easy") == difficulty]
+            if tasks:
+                cells = [pooled(results, variant, report, tasks) for variant in SHOWN[suite]]
+                title = f"{split}, {difficulty} ({len(tasks)})"
+                rows.append([title, *cells, *papers(suite, split, tasks)])
+    return format_table([head(suite, "tasks"), *rows])
 
 
 def variants_table(results: dict) -> str:
     """What decides: a row a variant."""
     rows = []
     for variant, title in VARIANTS.items():
-        columns = ("base", 0), ("novel", "before"), ("novel", "after")
+        columns = REPORT["base"], ("novel", "before"), REPORT["novel"]
         if runs_of(results, variant):
             rows.append([title, *(mean(results, variant, *column) for column in columns)])
     head = ["ML10", "base", "novel, no gradient step", "novel, 200 steps"]
     return format_table([head, *rows])
+
+
+def policies_table(results: dict) -> str:
+    """The paper's policies, without and with meta-training, beside what the paper has of them."""
+    rows = [["ML10", *(f"{split}{how}" for split in REPORT for how in ("", " + MAML"))]]
+    rows[0] += [f"paper, {split}, without / with" for split in REPORT]
+    ours = {f"ml10-{key}": (f"ml10-{key}-maml", name) for key, name in POLICIES.items()}
+    for plain, (meta, name) in ({"ml10-no-inner-loop": ("ml10-dami", "DAMI")} | ours).items():
+        row = [mean(results, v, *column) for column in REPORT.values() for v in (plain, meta)]
+        for split, tasks in TASKS["ml10"].items():
+            theirs = f"{np.mean([PAPER['ml10'][split][t][name] for t in tasks]):.1f}"
+            if name == "DAMI":
+                row.append(f"- / {theirs}")
+            else:
+                maml = PAPER["ml10"]["base_maml_avg" if split == "base" else "novel_maml"][name]
+                row.append(f"{theirs} / {np.mean(maml):.1f}")
+        rows.append([name, *row])
+    return format_table(rows)
 
 
 def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
@@ -221,13 +247,13 @@ def reading_table(results: dict) -> str:
 
 
 def looks_table(results: dict) -> str:
-    """A row a run that was also rolled out with four actions of five steps for eight of ten."""
-    columns = ("base", 0), ("novel", "after")
-    rows = [["run", *(f"{split}, {n}" for split, _ in columns for n in ("8 of 10", "4 of 5"))]]
+    """A row a run that was also rolled out with eight actions of ten steps for four of five."""
+    columns = REPORT.values()
+    rows = [["run", *(f"{split}, {n}" for split in REPORT for n in ("8 of 10", "4 of 5"))]]
     for name, run in sorted(results.items()):
-        again = results.get(name.replace("-seed", "-four-seed"))
-        if again and again["training"] == run["training"]:
-            cells = [pooled_success(measured(r, *c)) for c in columns for r in (run, again)]
+        before = results.get(name.replace("-seed", "-eight-seed"))
+        if before and before["training"] == run["training"]:
+            cells = [pooled_success(measured(r, *c)) for c in columns for r in (before, run)]
             rows.append([f"{VARIANTS[name.rsplit('-seed')[0]]}, seed {name[-1]}", *cells])
     return format_table(rows)
 
@@ -248,6 +274,10 @@ TABLES = {
     "novel": by_task_table("novel"),
     "difficulty": difficulty_table,
     "variants": variants_table,
+    "policies": policies_table,
+    "ml45 means": lambda results: means_table(results, "ml45"),
+    "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),
+    "ml45 novel": by_task_table("novel", "ml45"),
     "looks": looks_table,
     "swap": swap_table,
     "reading": reading_table,
@@ -320,10 +350,10 @@ def draw_adaptation(results: dict, path: Path) -> None:
 def draw_by_task(results: dict, path: Path) -> None:
     """Success by task, of all seeds together, beside the paper's."""
     columns: dict[str, Successes] = {}
-    for variant, label in SHOWN.items():
-        columns[label] = {task: [] for task in BASE + NOVEL}
+    for variant, label in SHOWN["ml10"].items():
+        columns[label] = {task: [] for tasks in TASKS["ml10"].values() for task in tasks}
         for run in runs_of(results, variant):
-            found = measured(run, "base") | measured(run, "novel", "after")
+            found = measured(run, *REPORT["base"]) | measured(run, *REPORT["novel"])
             for task, successes in found.items():
                 columns[label][task] += successes
     title = "base tasks directly, novel tasks (the last five) after 200 steps"

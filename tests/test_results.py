@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evaluate import wilson_interval
-from tests.results import BASE, NOVEL, RESULTS, ROOT, TABLES, fill, runs_of
+from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, fill, runs_of
 from tests.runs import VARIANTS
 
 HELD = json.loads(RESULTS.read_text())
@@ -34,16 +34,19 @@ def test_a_cell_can_be_recomputed_from_the_episodes(report, column, task):
 
 def test_runs_are_of_the_variants_that_they_name():
     for name, run in HELD.items():
-        variant, seed = re.fullmatch(r"(?:ml10-)?(.*)-seed(\d)", name).groups()
-        variant = variant.removesuffix("-cpu").removesuffix("-four")
+        suite, variant, seed = re.fullmatch(r"(ml\d\d-)?(.*)-seed(\d)", name).groups()
+        variant = variant.removesuffix("-cpu").removesuffix("-eight")
         arguments, config = run["training"]["arguments"], run["training"]["config"]
-        steps = 1 if variant == "scratch" else 10_000
+        steps = {"scratch": 1}.get(variant, 5_000 if suite == "ml45-" else 10_000)
         assert arguments["seed"] == int(seed) and arguments["steps"] == steps
-        multi_task = variant in ("neither", "30-demonstrations")
+        assert suite is None or arguments["suite"] == suite[:-1]
+        policy = variant.removesuffix("-maml")
+        assert config.get("policy", "dami") == (policy if policy in POLICIES else "dami")
+        multi_task = variant in ("neither", "30-demonstrations", *POLICIES)
         off = variant.endswith("inner-loop") or multi_task or variant == "scratch"
         assert (arguments["maml"] == "off") == off
         silent = config["demo_encoder"] == "none"
-        assert silent == (multi_task or variant == "no-demonstration")
+        assert silent == (multi_task or policy in POLICIES or variant == "no-demonstration")
         always_told = arguments.get("instruction_dropout", 0) == 0
         assert always_told == (variant.startswith("before") or silent)
         assert variant in VARIANTS or variant.startswith("before")
@@ -57,5 +60,6 @@ def test_every_result_says_how_it_was_measured():
         for report in (report for name, report in run.items() if name != "training"):
             assert {"command", "hardware", "seed", "date", "text weights"} <= set(report["facts"])
             for tasks in report["successes"].values():
-                assert set(tasks) <= {*BASE, *NOVEL} and set("".join(tasks.values())) <= {*"01"}
+                assert any(set(tasks) <= {*s["base"], *s["novel"]} for s in TASKS.values())
+                assert set("".join(tasks.values())) <= {*"01"}
                 assert len({len(episodes) for episodes in tasks.values()}) == 1

@@ -1,5 +1,6 @@
 """Tests of train.py: Algorithm 1's batches and steps, whole runs at preset `tiny`, bad input."""
 
+import contextlib
 import functools
 import json
 import os
@@ -129,6 +130,47 @@ def test_products_in_bfloat16_leave_nearly_the_same_gradient(recorded):
     )
     assert half.dtype == torch.float32 and not torch.equal(whole, half)
     assert torch.cosine_similarity(whole, half, dim=0) > 0.99
+
+
+class Replayed:
+    """What stands in for a CUDA graph where there is no GPU: it runs the function again."""
+
+    captured: scripts.Captured
+
+    def replay(self):
+        again = self.captured.function(*self.captured.inputs)
+        torch._foreach_copy_(list(self.captured.outputs), list(again))
+
+
+def test_a_captured_function_is_the_function_until_the_next_call(monkeypatch):
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    weight, calls = torch.full((3,), 2.0, device=device, requires_grad=True), []
+
+    def function(batch, more):
+        calls.append(batch)
+        loss = ((weight * batch["x"]) ** 2).sum() + more[0].sum()
+        return loss.detach(), torch.autograd.grad(loss, weight)[0]
+
+    captured = scripts.Captured(function)
+    if device == "cpu":
+        graph, nothing = Replayed(), lambda *_: contextlib.nullcontext()
+        graph.captured = captured
+        streams = SimpleNamespace(wait_stream=lambda stream: None)
+        monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: graph)
+        for name in ("Stream", "current_stream"):
+            monkeypatch.setattr(torch.cuda, name, lambda: streams)
+        for name in ("stream", "graph"):
+            monkeypatch.setattr(torch.cuda, name, nothing)
+
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        x, y = torch.randn(2, 3, generator=generator).to(device)
+        given, found = ({"x": x.clone()}, [y.clone()]), captured({"x": x}, [y])
+        assert all(batch["x"] is not x for batch in calls)  # it works on copies
+        assert all(torch.allclose(a, b) for a, b in zip(found, function(*given)))
+        with torch.no_grad():
+            weight += 1  # in place, as an optimizer does
+        assert torch.equal(x, given[0]["x"])  # the caller's own stays as it was
 
 
 def test_training_leaves_everything_that_it_promises(run):
