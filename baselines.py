@@ -430,7 +430,7 @@ class FreqPolicy(DAMIPolicy):
     Left open, and chosen: condition tokens stand in the sequence (the code also attends to them
     separately, and has gated MLPs); the share of hidden places is drawn for each window (there: for
     each batch); the head learns the noise and no variance, reads c / H, and takes ten deterministic
-    DDIM steps whose clean action is clipped (there: ten random ones, unclipped).
+    DDIM steps (`small`: five) whose clean action is clipped (there: ten random ones, unclipped).
     """
 
     network = FrequencyTransformer

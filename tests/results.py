@@ -90,10 +90,12 @@ def take(results: dict, run: Path) -> None:
         path = Path(f"{run}-{name}") / "success.json"
         if path.exists():
             report = json.loads(path.read_text())
-            report["successes"] = {
-                column: {task: "".join(str(int(s)) for s in e) for task, e in tasks.items()}
-                for column, tasks in report["successes"].items()
-            }
+            for part in ("successes", "checkpoints"):
+                if part in report:
+                    report[part] = {
+                        column: {task: "".join(str(int(s)) for s in e) for task, e in tasks.items()}
+                        for column, tasks in report[part].items()
+                    }
             results[run.name][name] = report
 
 
@@ -201,6 +203,19 @@ def variants_table(results: dict) -> str:
     return format_table([head, *rows])
 
 
+def length_table(results: dict) -> str:
+    """A row a checkpoint of the runs whose checkpoints were all measured."""
+    rows = [["outer steps", "minutes", "base tasks"]]
+    for run in results.values():
+        for label, tasks in run.get("top", {}).get("checkpoints", {}).items():
+            step, whole = int(label[-5:]), run["training"]["arguments"]["steps"]
+            minutes = run["training"]["minutes"] * step / whole
+            episodes = "".join(tasks.values())
+            success = format_success(episodes.count("1"), len(episodes))
+            rows.append([str(step), f"{minutes:.0f}", success])
+    return format_table(rows)
+
+
 def policies_table(results: dict) -> str:
     """The paper's policies, without and with meta-training, beside what the paper has of them."""
     rows = [["ML10", *(f"{split}{how}" for split in REPORT for how in ("", " + MAML"))]]
@@ -274,6 +289,7 @@ TABLES = {
     "novel": by_task_table("novel"),
     "difficulty": difficulty_table,
     "variants": variants_table,
+    "length": length_table,
     "policies": policies_table,
     "ml45 means": lambda results: means_table(results, "ml45"),
     "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),

@@ -35,7 +35,7 @@ def test_a_cell_can_be_recomputed_from_the_episodes(report, column, task):
 def test_runs_are_of_the_variants_that_they_name():
     for name, run in HELD.items():
         suite, variant, seed = re.fullmatch(r"(ml\d\d-)?(.*)-seed(\d)", name).groups()
-        variant = variant.removesuffix("-cpu").removesuffix("-eight")
+        variant = variant.removesuffix("-eight").removesuffix("-cpu")
         arguments, config = run["training"]["arguments"], run["training"]["config"]
         steps = {"scratch": 1}.get(variant, 5_000 if suite == "ml45-" else 10_000)
         assert arguments["seed"] == int(seed) and arguments["steps"] == steps
