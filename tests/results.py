@@ -52,10 +52,12 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-neither": "without both: multi-task training",
     "ml10-30-demonstrations": "multi-task training, thirty demonstrations",
     "ml10-scratch": "from random weights",
+    "ml10-scratch-eight": "eight actions of ten steps: from random weights",
     "ml10-dami-eight": "eight actions of ten steps: DAMI",
     "ml10-inner-3e-2": "eight actions of ten steps: DAMI with an inner rate of 3e-2",
     "ml10-no-inner-loop-eight": "eight actions of ten steps: without the inner loop",
     "ml10-neither-eight": "eight actions of ten steps: multi-task training",
+    "ml45-no-inner-loop": "ML45, without the inner loop",
     "before": "until 2026-11-23: the instruction always told, inner rate 1e-4, DDIM, eight of ten",
     "before-no-inner-loop": "until 2026-11-23, without the inner loop",
 }
@@ -197,23 +199,11 @@ def variants_table(results: dict) -> str:
     rows = []
     for variant, title in VARIANTS.items():
         columns = REPORT["base"], ("novel", "before"), REPORT["novel"]
-        if runs_of(results, variant):
-            rows.append([title, *(mean(results, variant, *column) for column in columns)])
+        cells = [mean(results, variant, *column) for column in columns]
+        if any(cells) and not variant.startswith("ml45"):  # it has a table of its own
+            rows.append([title, *cells])
     head = ["ML10", "base", "novel, no gradient step", "novel, 200 steps"]
     return format_table([head, *rows])
-
-
-def length_table(results: dict) -> str:
-    """A row a checkpoint of the runs whose checkpoints were all measured."""
-    rows = [["outer steps", "minutes", "base tasks"]]
-    for run in results.values():
-        for label, tasks in run.get("top", {}).get("checkpoints", {}).items():
-            step, whole = int(label[-5:]), run["training"]["arguments"]["steps"]
-            minutes = run["training"]["minutes"] * step / whole
-            episodes = "".join(tasks.values())
-            success = format_success(episodes.count("1"), len(episodes))
-            rows.append([str(step), f"{minutes:.0f}", success])
-    return format_table(rows)
 
 
 def policies_table(results: dict) -> str:
@@ -267,7 +257,7 @@ def looks_table(results: dict) -> str:
     rows = [["run", *(f"{split}, {n}" for split in REPORT for n in ("8 of 10", "4 of 5"))]]
     for name, run in sorted(results.items()):
         before = results.get(name.replace("-seed", "-eight-seed"))
-        if before and before["training"] == run["training"]:
+        if before and "base" in before and before["training"] == run["training"]:
             cells = [pooled_success(measured(r, *c)) for c in columns for r in (before, run)]
             rows.append([f"{VARIANTS[name.rsplit('-seed')[0]]}, seed {name[-1]}", *cells])
     return format_table(rows)
@@ -289,7 +279,6 @@ TABLES = {
     "novel": by_task_table("novel"),
     "difficulty": difficulty_table,
     "variants": variants_table,
-    "length": length_table,
     "policies": policies_table,
     "ml45 means": lambda results: means_table(results, "ml45"),
     "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),
@@ -340,9 +329,11 @@ def draw_adaptation(results: dict, path: Path) -> None:
     shots = [(n, f"{n}-shot", "after") for n in (1, 3, 5)] + [(10, "curve", "after")]
     steps = [(0, "curve", "before"), *((n, "curve", f"{n} steps") for n in (1, 5, 20, 50))]
     panels = {"gradient steps, ten demonstrations": [*steps, (200, "curve", "after")]}
-    panels["demonstrations, 200 gradient steps"] = shots
-    figure = Figure(figsize=(8, 3.8), layout="constrained")
-    for axes, (label, points) in zip(figure.subplots(1, 2, sharey=True), panels.items()):
+    if any("1-shot" in run for run in results.values()):
+        panels["demonstrations, 200 gradient steps"] = shots
+    figure = Figure(figsize=(2 + 3 * len(panels), 3.8), layout="constrained")
+    places = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
+    for axes, (label, points) in zip(places, panels.items()):
         for variant, title in VARIANTS.items():
             curve = [(x, together(results, variant, report)) for x, *report in points]
             if not (curve := [(x, episodes) for x, episodes in curve if episodes]):

@@ -52,7 +52,6 @@ REPORTS = {  # name -> command, of which variants (all: ()); {run} is the run's 
     "told": ("evaluate.py --checkpoint {run} --swap demonstration instruction", READS),
     "swap": ("evaluate.py --checkpoint {run} --without instruction --swap demonstration", READS),
     "one-shot": ("evaluate.py --checkpoint {run} --split novel --without instruction", READS),
-    "top": ("evaluate.py --checkpoint {run} --top 5 --episodes 20", ("neither",)),
     "alone": ("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
 }
 # Along the adaptation, and with fewer demonstrations: 20 episodes.
