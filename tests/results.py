@@ -92,12 +92,10 @@ def take(results: dict, run: Path) -> None:
         path = Path(f"{run}-{name}") / "success.json"
         if path.exists():
             report = json.loads(path.read_text())
-            for part in ("successes", "checkpoints"):
-                if part in report:
-                    report[part] = {
-                        column: {task: "".join(str(int(s)) for s in e) for task, e in tasks.items()}
-                        for column, tasks in report[part].items()
-                    }
+            report["successes"] = {
+                column: {task: "".join(str(int(s)) for s in e) for task, e in tasks.items()}
+                for column, tasks in report["successes"].items()
+            }
             results[run.name][name] = report
 
 
@@ -134,6 +132,7 @@ def papers(suite: str, split: str, tasks: list[str]) -> list[str]:
 
 
 def head(suite: str, title: str) -> list[str]:
+    """The first row of a table of a suite's variants."""
     return [title, *SHOWN[suite].values(), "paper, DP3", "paper, DAMI"]
 
 
@@ -176,7 +175,7 @@ def together(
 
 
 def pooled(results: dict, variant: str, report: tuple[str, int | str], tasks: list[str]) -> str:
-    """Their share of successes."""
+    """The share of successes in some tasks, of all of a variant's seeds together."""
     episodes = together(results, variant, report, tasks)
     return format_success(sum(episodes), len(episodes)) if episodes else ""
 
@@ -202,8 +201,7 @@ def variants_table(results: dict) -> str:
         cells = [mean(results, variant, *column) for column in columns]
         if any(cells) and not variant.startswith("ml45"):  # it has a table of its own
             rows.append([title, *cells])
-    head = ["ML10", "base", "novel, no gradient step", "novel, 200 steps"]
-    return format_table([head, *rows])
+    return format_table([["ML10", "base", "novel, no gradient step", "novel, 200 steps"], *rows])
 
 
 def policies_table(results: dict) -> str:
