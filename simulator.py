@@ -274,8 +274,9 @@ class RayCastCamera:
         self.scenery, self.top = self.find_scenery()  # (geoms,) bool, and its height
         of_arm = np.isin(model.geom_bodyid, [model.body(name).id for name in arm])
         self.arm = np.flatnonzero(of_arm & VISIBLE[model.geom_group])
-        self.things = ~self.scenery & ~of_arm
-        self.still = self.things & (model.body_weldid[model.geom_bodyid] == 0)  # in an episode
+        self.things = ~self.scenery & ~of_arm & VISIBLE[model.geom_group]
+        fixed = (model.body_weldid == 0) & (model.body_mocapid[model.body_rootid] < 0)
+        self.still = self.things & fixed[model.geom_bodyid]  # in an episode; a mocap body is moved
         self.still_at, self.met_still = None, None
 
         # The rays that meet the workspace: they enter each slab of it before they leave any. And
@@ -349,18 +350,19 @@ class RayCastCamera:
             The distances (R,) in metres, inf where nothing is hit, and what is hit (R,): the index
             of a geom, -1 for nothing, or -2 - index of a site.
         """
-        distance, hit = np.full(len(rays), -1.0), np.full(len(rays), -1, dtype=np.int32)
+        distance, hit = np.full(len(rays), np.inf), np.full(len(rays), -1, dtype=np.int32)
 
-        groups = self.model.geom_group.copy()
+        groups, near = self.model.geom_group.copy(), np.arange(len(rays))
         if geoms is not None:
             self.model.geom_group[~geoms] = HIDDEN_GROUP
+            near = self.near(data, rays, np.flatnonzero(geoms))
+        t, what = np.empty(len(near)), np.empty(len(near), dtype=np.int32)
         target = (VISIBLE.astype(np.uint8), 1, -1)  # these groups, static geoms too, of every body
         mujoco.mj_multiRay(
-            self.model, data, self.origin, rays.ravel(), *target, hit, distance, len(rays), cutoff
+            self.model, data, self.origin, rays[near].ravel(), *target, what, t, len(near), cutoff
         )
         self.model.geom_group[:] = groups
-        hit[distance < 0] = -1
-        distance[distance < 0] = np.inf
+        distance[near[t >= 0]], hit[near[t >= 0]] = t[t >= 0], what[t >= 0]
 
         for site in self.sites if sites is None else sites:
             ball = data.site_xpos[site], np.eye(3), np.repeat(self.model.site_size[site, 0], 3)
@@ -370,6 +372,12 @@ class RayCastCamera:
             hit[closer] = -2 - site
 
         return distance, hit
+
+    def near(self, data: mujoco.MjData, rays: np.ndarray, geoms: np.ndarray) -> np.ndarray:
+        """Returns which of the rays (R, 3) meet a ball around any of these geoms: indices."""
+        to, radius = data.geom_xpos[geoms] - self.origin, self.model.geom_rbound[geoms]
+        radius[self.model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_PLANE] = np.inf
+        return np.flatnonzero(((rays @ to.T) ** 2 >= (to**2).sum(axis=1) - radius**2).any(axis=1))
 
     def cast_at_arm(self, data: mujoco.MjData, rays: np.ndarray) -> np.ndarray:
         """Returns the distances (R,) in metres to the arm's ellipsoids, inf where none is met."""

@@ -249,6 +249,18 @@ def test_the_arm_fills_up_a_cloud_and_fewer_points_are_the_first_of_more():
     assert of_arm.sum() == 128 - len(things) > 100
 
 
+def test_what_stands_still_is_met_once_an_episode():
+    env = MetaWorldPointCloudEnv("shelf-place")
+    met = []
+    for seed in (0, 1):  # each puts the shelf elsewhere
+        env.begin(seed)
+        for _ in range(3):
+            env.cloud()
+            met.append(env.camera.met_still)
+            env.advance(env.expert_action())
+    assert met[0] is met[1] is met[2] is not met[3] is met[4] is met[5]
+
+
 def test_the_goal_marker_is_in_the_cloud(reach):
     for seed in range(5):
         observation, _ = reach.reset(seed=seed)
