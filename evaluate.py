@@ -728,7 +728,7 @@ def main(argv: list[str] | None = None) -> None:
     evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after collecting
     if args.gif:
         movie_writer(args.gif)  # refuses a wrong name now
-    device = scripts.pick_device(args.device)
+    device = scripts.pick_device(args.device, args.threads)
 
     # Which checkpoints: of each run the last, or all of them for the mean of the best
     runs = [

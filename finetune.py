@@ -194,7 +194,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
     settings = Settings().given(args)
-    device = scripts.pick_device(args.device)
+    device = scripts.pick_device(args.device, args.threads)
 
     # Which tasks, and from which policy
     file = Path(args.data) if args.data.endswith(".npz") else None

@@ -157,6 +157,7 @@ def add_common_flags(add: Callable[..., Any]) -> None:
     """Adds the flags that training, adaptation and evaluation share."""
     add("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
     add("--workers", type=int, help="processes for collecting and evaluating (default: one a core)")
+    add("--threads", type=int, help="of PyTorch; 1 beside busy processes (default: one a core)")
     add("--clip-weights", help="CLIP's ViT-B-32.pt, or `random` (default: as before, or download)")
 
 
@@ -204,8 +205,15 @@ def command_line(main: Callable[[], None], *errors: type[Exception]) -> None:
     sys.exit(code)
 
 
-def pick_device(name: str | None) -> torch.device:
-    """`cuda` where there is one unless a name is given; ValueError for a missing device."""
+def pick_device(name: str | None, threads: int | None = None) -> torch.device:
+    """`cuda` where there is one unless a name is given; ValueError for a missing device.
+
+    On the CPU PyTorch takes so many `threads`. They wait for each other, so one whose core is busy
+    with another process delays all. Rounding depends on their number.
+    """
+    at_least(1, threads=threads)
+    if threads is not None:
+        torch.set_num_threads(threads)
     name = name or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)

@@ -277,7 +277,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    device = scripts.pick_device(args.device)
+    device = scripts.pick_device(args.device, args.threads)
     own = own_recordings(args.data) if args.data and not args.suite else {}  # task -> file
     default = "paper" if device.type == "cuda" else "small"
     preset = choose(args.preset or default, PRESETS, "preset")

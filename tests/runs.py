@@ -11,7 +11,6 @@ demonstration does. A job whose result exists is skipped, a training that was in
 """
 
 import argparse
-import os
 import subprocess
 import sys
 import threading
@@ -32,11 +31,11 @@ VARIANTS = {
     "no-dropout": "--instruction-dropout 0",
     "more-dropout": "--instruction-dropout 0.5",
     "no-support-only": "--support-only 0",
-    "mlp": "--demo-encoder mlp",
-    "mid": "--tcfm mid",
-    "up": "--tcfm up",
-    "baseline": "--demo-encoder mlp --tcfm none",
-    "vmt": "--tcfm none",
+    "mlp": "--demo-encoder mlp --maml off",
+    "mid": "--tcfm mid --maml off",
+    "up": "--tcfm up --maml off",
+    "baseline": "--demo-encoder mlp --tcfm none --maml off",
+    "vmt": "--tcfm none --maml off",
     "scratch": "--maml off --warmup 10000 --steps 1",  # at a rate of 1e-7: a policy of chance
 }
 VARIANTS |= {policy: f"--policy {policy} --maml off" for policy in ("dp3", "flow", "mamba", "freq")}
@@ -70,20 +69,19 @@ class Job:
     log: Path
 
     def run(self) -> int:
-        """Runs it in a process with one thread; returns the exit code."""
+        """Runs it in a process; returns the exit code."""
         self.log.parent.mkdir(parents=True, exist_ok=True)
-        environment = os.environ | {"OMP_NUM_THREADS": "1"}
         with self.log.open("a") as log:
             print(f"$ python {self.command}", file=log, flush=True)
             words = [sys.executable, *self.command.split()]
-            return subprocess.run(words, env=environment, stdout=log, stderr=log).returncode
+            return subprocess.run(words, stdout=log, stderr=log).returncode
 
 
 def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list[Job]:
     """Training first, then what measures it."""
     run = Path(f"runs/{suite}-{variant}-seed{seed}")
     flags = f"--suite {suite} --preset small --seed {seed} --episodes 0 --out {run}"
-    flags += f" --steps {steps} --clip-weights random {VARIANTS[variant]}"
+    flags += f" --threads 1 --steps {steps} --clip-weights random {VARIANTS[variant]}"
     resume = " --resume" if (run / "last.pt").exists() else ""
     last = run / f"ema-{1 if variant == 'scratch' else steps:05d}.pt"
     listed = [Job(f"train.py {flags}{resume}", last, run.with_suffix(".log"))]
@@ -92,8 +90,9 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
             continue
         out = Path(f"{run}-{name}")
         script, words = command.format(run=run).split(" ", 1)
-        measured = f"{script} --episodes {episodes} {words} --seed {SEED} --workers 1 --out {out}"
-        listed.append(Job(f"{measured} --overwrite", out / "success.json", run.with_suffix(".log")))
+        measured = f"{script} --episodes {episodes} {words} --seed {SEED} --workers 1 --threads 1"
+        measured += f" --out {out} --overwrite"
+        listed.append(Job(measured, out / "success.json", run.with_suffix(".log")))
     return listed
 
 

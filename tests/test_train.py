@@ -516,6 +516,7 @@ def test_what_concerns_the_inner_step_may_differ_before_the_first_one(run, recor
         ("--preset tny", "unknown preset 'tny': did you mean 'tiny'?"),
         ("--steps 0", "--steps is 0: use at least 1"),
         ("--demonstrations 0", "--demonstrations is 0: use at least 1"),
+        ("--threads 0", "--threads is 0: use at least 1"),
         ("--num-points 0", "num_points is 0: use at least 1"),
         ("--after-success -1", "--after-success is -1: use at least 0"),
         ("--seed -1", "--seed is -1: use at least 0"),
