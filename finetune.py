@@ -26,6 +26,7 @@ import evaluate
 import scripts
 from data import WindowSampler, load_demonstrations
 from model import DAMIPolicy, ema_model
+from report import write_report
 from scripts import Flags, command_line, load_checkpoint, progress_bar, save_checkpoint, setting
 from simulator import check_task, collect, is_simulated, suite_tasks
 
@@ -258,7 +259,7 @@ def main(argv: list[str] | None = None) -> None:
         kept = ("steps", "demonstrations", "episodes", "seed", "instruction")
         facts |= {"text weights": identity} | {key: getattr(settings, key) for key in kept}
         facts |= scripts.report_facts("finetune.py", argv, device) | changed
-        print(f"\n{evaluate.write_report(folder, results, facts, info['suite'])}")
+        print(f"\n{write_report(folder, results, facts, info['suite'])}")
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from torch.optim.swa_utils import AveragedModel
 
 import baselines
 import evaluate
+import report
 import scripts
 from data import WindowSampler, load_demonstrations
 from maml import meta_gradient
@@ -378,13 +379,14 @@ def run(
                 raise KeyboardInterrupt(f"saved after step {step}, add --resume to go on")
             if leader and milestone:
                 evaluate.judge(folder, step, ema.module, samplers, unseen, text)
-                evaluate.draw_curves(folder)
+                report.draw_curves(folder)
                 evaluate.evaluate_step(folder, step, *how)
             began = time.monotonic()
 
     if leader:
         successes = evaluate.evaluate_step(folder, settings.steps, *how)
-        evaluate.report_training(folder, settings, config.policy, seconds, facts, successes)
+        facts |= {"seed": evaluate.EVALUATION_SEED}
+        report.report_training(folder, settings, config.policy, seconds, facts, successes)
 
 
 if __name__ == "__main__":

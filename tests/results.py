@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from data import write_atomically
-from evaluate import (
-    SHIPPED_CHECKPOINT,
-    TRAINED,
+from evaluate import SHIPPED_CHECKPOINT, TRAINED
+from model import PRESETS
+from report import (
     Successes,
     draw_success,
     format_success,
@@ -29,7 +29,6 @@ from evaluate import (
     pooled_success,
     wilson_interval,
 )
-from model import PRESETS
 from scripts import format_table, load_checkpoint, save_checkpoint
 from simulator import suite_tasks
 from tests.runs import REPORTS

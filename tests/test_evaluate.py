@@ -17,6 +17,7 @@ import data
 import evaluate
 import finetune
 import model
+import report
 import scripts
 import simulator
 import train
@@ -28,35 +29,35 @@ pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
 
 
 def test_success_is_written_in_percent_with_its_interval():
-    assert evaluate.format_success(17, 20) == "85.0 [64.0, 94.8]"
-    assert evaluate.format_success(0, 20) == "0.0 [0.0, 16.1]"
-    assert evaluate.mean_success({"a": [True, False], "b": [True, True, True]}) == 75.0
+    assert report.format_success(17, 20) == "85.0 [64.0, 94.8]"
+    assert report.format_success(0, 20) == "0.0 [0.0, 16.1]"
+    assert report.mean_success({"a": [True, False], "b": [True, True, True]}) == 75.0
 
 
 def test_the_mean_over_runs_has_students_interval():
-    assert evaluate.mean_interval([50.0]) == "50.0 (one run)"
+    assert report.mean_interval([50.0]) == "50.0 (one run)"
     # 4.303 * 10 / sqrt(3)
-    assert evaluate.mean_interval([40.0, 50.0, 60.0]) == "50.0 ± 24.8 (3 runs)"
+    assert report.mean_interval([40.0, 50.0, 60.0]) == "50.0 ± 24.8 (3 runs)"
 
 
 def test_a_table_has_a_row_a_task_the_mean_and_the_papers_figures():
     successes = {"reach": [True, False], "drawer-close": [True, True]}
-    table = evaluate.success_table({"ours": successes}, "ml10")
+    table = report.success_table({"ours": successes}, "ml10")
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
     assert rows[0] == ["task", "ours", "paper"]
     assert [row[0] for row in rows[2:]] == ["reach", "drawer-close", "**mean**"]
-    assert rows[4][1] == evaluate.format_success(3, 4)
-    paper = [evaluate.paper_success("ml10", task) for task in ("reach", "drawer-close")]
+    assert rows[4][1] == report.format_success(3, 4)
+    paper = [report.paper_success("ml10", task) for task in ("reach", "drawer-close")]
     assert [row[2] for row in rows[2:]] == [f"{value:.1f}" for value in (*paper, sum(paper) / 2)]
 
 
 def test_base_and_novel_tasks_have_means_of_their_own_and_columns_are_aligned():
     successes = {"reach": [True], "window-open": [True], "door-close": [False]}
-    table = evaluate.success_table({"ours": successes}, "ml10").splitlines()
+    table = report.success_table({"ours": successes}, "ml10").splitlines()
     assert len({len(line) for line in table}) == 1
     means = {line.split("|")[1].strip(): line.split("|")[2].split()[0] for line in table[5:]}
     assert means == {"**mean of base**": "100.0", "**mean of novel**": "0.0"}
-    assert "**mean** " in evaluate.success_table({"ours": successes})  # of no suite
+    assert "**mean** " in report.success_table({"ours": successes})  # of no suite
 
 
 # ---- Which checkpoint ----------------------------------------------------------------------------
@@ -113,10 +114,10 @@ def test_evaluating_again_with_other_workers_gives_the_same_episodes(
     monkeypatch.setattr(evaluate, "EPISODES_A_JOB", 1)  # as in the run
     options = "--episodes 2 --workers 1 --out report"
     evaluate.main(evaluating(run, recorded, options))
-    report = json.loads(Path("report/success.json").read_text())
+    written = json.loads(Path("report/success.json").read_text())
     trained = json.loads((run / "success.json").read_text())
     label = "ml10-tiny-seed0/ema-00006"
-    assert report["successes"] == {label: trained["successes"]["last checkpoint"]}
+    assert written["successes"] == {label: trained["successes"]["last checkpoint"]}
     monkeypatch.setattr(evaluate, "collect", None)  # said before anything is collected
     message = fails(evaluate, evaluating(run, recorded, options), capsys)
     assert "already holds success.json: add --overwrite" in message
@@ -204,9 +205,9 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(
     assert calls[0][2:] == (True, {"n_action_steps": 4}) and all(
         not text.any() for text in calls[0][1].values()
     )
-    report = json.loads(Path("without/success.json").read_text())
-    assert report["facts"]["without"] == "demonstration and instruction"
-    assert report["facts"]["n_action_steps"] == 4 and "sampler" not in report["facts"]
+    written = json.loads(Path("without/success.json").read_text())
+    assert written["facts"]["without"] == "demonstration and instruction"
+    assert written["facts"]["n_action_steps"] == 4 and "sampler" not in written["facts"]
     assert "--swap needs" in fails(
         evaluate, evaluating(run, recorded, f"--task reach {swap}"), capsys
     )

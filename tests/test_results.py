@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from evaluate import wilson_interval
+from report import wilson_interval
 from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, fill, runs_of
 from tests.runs import VARIANTS
 

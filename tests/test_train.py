@@ -33,6 +33,7 @@ import data
 import evaluate
 import finetune
 import model
+import report
 import scripts
 import train
 
@@ -185,12 +186,12 @@ def test_training_leaves_everything_that_it_promises(run):
     assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
     assert all(np.isfinite(line["loss"]) and line["gradient_norm"] > 0 for line in lines)
     (evaluated,) = (line for line in metrics(run) if "success" in line)
-    report = json.loads((run / "success.json").read_text())
-    successes = report["successes"]["last checkpoint"]
+    written = json.loads((run / "success.json").read_text())
+    successes = written["successes"]["last checkpoint"]
     assert list(successes) == BASE and all(len(episodes) == 2 for episodes in successes.values())
     assert evaluated["successes"] == successes
-    assert evaluated["success"] == evaluate.mean_success(successes)
-    assert report["facts"]["seed"] == evaluate.EVALUATION_SEED == 0
+    assert evaluated["success"] == report.mean_success(successes)
+    assert written["facts"]["seed"] == evaluate.EVALUATION_SEED == 0
     table = (run / "success.md").read_text()
     assert all(f"| {task} " in table for task in BASE)
     assert "paper" in table and "random-seed-0" in table
@@ -278,8 +279,8 @@ def test_a_run_stopped_while_it_is_measured_is_measured_when_resumed(
     measured = {task: [True, False] for task in BASE}
     monkeypatch.setattr(evaluate, "evaluate", lambda *_: measured)
     train.main([*argv, "--resume"])
-    report = json.loads((tmp_path / "run" / "success.json").read_text())
-    assert report["successes"]["last checkpoint"] == measured
+    written = json.loads((tmp_path / "run" / "success.json").read_text())
+    assert written["successes"]["last checkpoint"] == measured
     assert (tmp_path / "run" / "curves.png").exists()
     assert not list((tmp_path / "run").glob(".*"))
     assert same_bits(whole_state(tmp_path / "run"), whole_state(run) | {"step": 6})
