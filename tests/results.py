@@ -71,6 +71,13 @@ POLICIES = {  # of baselines.py -> what the paper calls it
     "mamba": "Mamba",
     "freq": "FreqPolicy",
 }
+ABLATION = {  # a row of the paper's ablation -> our variant, and what it is
+    "baseline": ("baseline", "an MLP for VMT, no TCFM: the paper's Baseline"),
+    "+vmt": ("vmt", "VMT, no TCFM"),
+    "+tcfm-down": ("no-inner-loop", "VMT, TCFM in the first down-sampling level"),
+    "+tcfm-mid": ("mid", "VMT, TCFM in the middle"),
+    "+tcfm-up": ("up", "VMT, TCFM in the last up-sampling level"),
+}
 COLUMNS = {"dami": "DAMI", "no-inner-loop": "no inner loop", "neither": "multi-task"}
 SHOWN = {suite: {f"{suite}-{v}": title for v, title in COLUMNS.items()} for suite in TASKS}
 SHOWN["ml45"]["ml45-dp3"] = "DP3"
@@ -91,10 +98,11 @@ def take(results: dict, run: Path) -> None:
         path = Path(f"{run}-{name}") / "success.json"
         if path.exists():
             report = json.loads(path.read_text())
-            report["successes"] = {
-                column: {task: "".join(str(int(s)) for s in e) for task, e in tasks.items()}
-                for column, tasks in report["successes"].items()
-            }
+            for part in {"successes", "checkpoints"} & set(report):
+                report[part] = {
+                    column: {task: "".join(str(int(s)) for s in e) for task, e in tasks.items()}
+                    for column, tasks in report[part].items()
+                }
             results[run.name][name] = report
 
 
@@ -221,6 +229,27 @@ def policies_table(results: dict) -> str:
     return format_table(rows)
 
 
+def ablation_table(results: dict) -> str:
+    """The rows of the paper's ablation, each with its mean there."""
+    rows = [["ML10, without the inner loop", *REPORT, "paper, novel"]]
+    for row, (variant, title) in ABLATION.items():
+        cells = [mean(results, f"ml10-{variant}", *report) for report in REPORT.values()]
+        rows.append([title, *cells, f"{np.mean(PAPER['ml10']['novel_ablation'][row]):.1f}"])
+    return format_table(rows)
+
+
+def length_table(results: dict) -> str:
+    """A row a checkpoint of the run whose checkpoints were all measured."""
+    rows = [["outer steps", "minutes", "base tasks"]]
+    for run in results.values():
+        for label, tasks in run.get("top", {}).get("checkpoints", {}).items():
+            step, whole = int(label[-5:]), run["training"]["arguments"]["steps"]
+            minutes, episodes = run["training"]["minutes"] * step / whole, "".join(tasks.values())
+            success = format_success(episodes.count("1"), len(episodes))
+            rows.append([str(step), f"{minutes:.0f}", success])
+    return format_table(rows)
+
+
 def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
     """Policy -> what it is shown, and its episodes on the base tasks."""
     found = {}
@@ -277,6 +306,8 @@ TABLES = {
     "difficulty": difficulty_table,
     "variants": variants_table,
     "policies": policies_table,
+    "ablation": ablation_table,
+    "length": length_table,
     "ml45 means": lambda results: means_table(results, "ml45"),
     "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),
     "ml45 novel": by_task_table("novel", "ml45"),
@@ -325,7 +356,8 @@ def draw_adaptation(results: dict, path: Path) -> None:
 
     shots = [(n, f"{n}-shot", "after") for n in (1, 3, 5)] + [(10, "curve", "after")]
     steps = [(0, "curve", "before"), *((n, "curve", f"{n} steps") for n in (1, 5, 20, 50))]
-    panels = {"gradient steps, ten demonstrations": [*steps, (200, "curve", "after")]}
+    steps += [(200, "curve", "after"), (500, "long", "500 steps"), (1000, "long", "after")]
+    panels = {"gradient steps, ten demonstrations": steps}
     if any("1-shot" in run for run in results.values()):
         panels["demonstrations, 200 gradient steps"] = shots
     figure = Figure(figsize=(2 + 3 * len(panels), 3.8), layout="constrained")

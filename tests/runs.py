@@ -51,10 +51,11 @@ REPORTS = {  # name -> command, of which variants (all: ()); {run} is the run's 
     "told": ("evaluate.py --checkpoint {run} --swap demonstration instruction", READS),
     "swap": ("evaluate.py --checkpoint {run} --without instruction --swap demonstration", READS),
     "one-shot": ("evaluate.py --checkpoint {run} --split novel --without instruction", READS),
+    "top": ("evaluate.py --checkpoint {run} --top 5 --episodes 20", ("neither",)),
     "alone": ("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
 }
 # Along the adaptation, and with fewer demonstrations: 20 episodes.
-CURVE = {"curve": "--curve 1 5 20 50"}
+CURVE = {"curve": "--curve 1 5 20 50", "long": "--steps 1000 --curve 500"}
 CURVE |= {f"{n}-shot": f"--demonstrations {n}" for n in (1, 3, 5)}
 for name, flags in CURVE.items():
     REPORTS[name] = (f"finetune.py --task novel --checkpoint {{run}} --episodes 20 {flags}", SHOWN)

@@ -43,7 +43,7 @@ def test_runs_are_of_the_variants_that_they_name():
         policy = variant.removesuffix("-maml")
         assert config.get("policy", "dami") == (policy if policy in POLICIES else "dami")
         multi_task = variant in ("neither", "30-demonstrations", *POLICIES)
-        off = variant.endswith("inner-loop") or multi_task or variant == "scratch"
+        off = "--maml off" in VARIANTS.get(variant.removeprefix("before-"), "")
         assert (arguments["maml"] == "off") == off
         silent = config["demo_encoder"] == "none"
         assert silent == (multi_task or policy in POLICIES or variant == "no-demonstration")
