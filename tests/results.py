@@ -373,7 +373,7 @@ def draw_adaptation(results: dict, path: Path) -> None:
             line = {"marker": "o", "markersize": 4, "capsize": 2, "linewidth": 1.5}
             axes.errorbar([x for x, _ in curve], 100 * rates, error, label=title, **line)
         axes.set_xscale("symlog", linthresh=1)
-        axes.set_xticks([x for x, *_ in points], [x for x, *_ in points])
+        axes.set_xticks([x for x, *_ in points], [x for x, *_ in points], fontsize=8)
         axes.minorticks_off()
         axes.set(xlabel=label, ylim=(0, 100))
         axes.spines[["top", "right"]].set_visible(False)
