@@ -360,7 +360,7 @@ def draw_adaptation(results: dict, path: Path) -> None:
     panels = {"gradient steps, ten demonstrations": steps}
     if any("1-shot" in run for run in results.values()):
         panels["demonstrations, 200 gradient steps"] = shots
-    figure = Figure(figsize=(2 + 3 * len(panels), 3.8), layout="constrained")
+    figure = Figure(figsize=(2 + 4 * len(panels), 3.8), layout="constrained")
     places = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
     for axes, (label, points) in zip(places, panels.items()):
         for variant, title in VARIANTS.items():
@@ -373,7 +373,7 @@ def draw_adaptation(results: dict, path: Path) -> None:
             line = {"marker": "o", "markersize": 4, "capsize": 2, "linewidth": 1.5}
             axes.errorbar([x for x, _ in curve], 100 * rates, error, label=title, **line)
         axes.set_xscale("symlog", linthresh=1)
-        axes.set_xticks([x for x, *_ in points], [x for x, *_ in points], fontsize=8)
+        axes.set_xticks([x for x, *_ in points], [x for x, *_ in points], fontsize=7)
         axes.minorticks_off()
         axes.set(xlabel=label, ylim=(0, 100))
         axes.spines[["top", "right"]].set_visible(False)
