@@ -274,7 +274,7 @@ class RayCastCamera:
         self.scenery, self.top = self.find_scenery()  # (geoms,) bool, and its height
         of_arm = np.isin(model.geom_bodyid, [model.body(name).id for name in arm])
         self.arm = np.flatnonzero(of_arm & VISIBLE[model.geom_group])
-        self.things = ~self.scenery & ~of_arm & VISIBLE[model.geom_group]
+        self.things = ~self.scenery & ~of_arm & VISIBLE[model.geom_group]  # (geoms,) bool
         fixed = (model.body_weldid == 0) & (model.body_mocapid[model.body_rootid] < 0)
         self.still = self.things & fixed[model.geom_bodyid]  # in an episode; a mocap body is moved
         self.still_at, self.met_still = None, None

@@ -2,6 +2,7 @@
 
     python -m tests.results runs/ml10-dami-seed0   # takes a run of tests.runs into RESULTS.json
     python -m tests.results                        # writes the tables, draws the charts
+    python -m tests.results --compare ml10-dami ml10-neither    # episodes won and lost, sign test
     python -m tests.results --ship CHECKPOINT      # makes it assets/ml10-small.pt, float16
 
 RESULTS.json holds for each run how it was trained and, for each report that measured it, every
@@ -16,6 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import binomtest
 
 from data import write_atomically
 from evaluate import SHIPPED_CHECKPOINT, TRAINED
@@ -98,7 +100,7 @@ def take(results: dict, run: Path) -> None:
         path = Path(f"{run}-{name}") / "success.json"
         if path.exists():
             report = json.loads(path.read_text())
-            for part in {"successes", "checkpoints"} & set(report):
+            for part in [name for name in ("successes", "checkpoints") if name in report]:
                 report[part] = {
                     column: {task: "".join(str(int(s)) for s in e) for task, e in tasks.items()}
                     for column, tasks in report[part].items()
@@ -358,11 +360,9 @@ def draw_adaptation(results: dict, path: Path) -> None:
     steps = [(0, "curve", "before"), *((n, "curve", f"{n} steps") for n in (1, 5, 20, 50))]
     steps += [(200, "curve", "after"), (500, "long", "500 steps"), (1000, "long", "after")]
     panels = {"gradient steps, ten demonstrations": steps}
-    if any("1-shot" in run for run in results.values()):
-        panels["demonstrations, 200 gradient steps"] = shots
-    figure = Figure(figsize=(2 + 4 * len(panels), 3.8), layout="constrained")
-    places = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
-    for axes, (label, points) in zip(places, panels.items()):
+    panels["demonstrations, 200 gradient steps"] = shots
+    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    for axes, (label, points) in zip(figure.subplots(1, 2, sharey=True), panels.items()):
         for variant, title in VARIANTS.items():
             curve = [(x, together(results, variant, report)) for x, *report in points]
             if not (curve := [(x, episodes) for x, episodes in curve if episodes]):
@@ -396,6 +396,25 @@ def draw_by_task(results: dict, path: Path) -> None:
     draw_success(columns, path, title, "ml10")
 
 
+def compare(results: dict, one: str, other: str) -> str:
+    """Episodes on the same goals that one variant wins and loses against another, run by run.
+
+    A row a report that both have, of its column "after" or else its first; p: two-sided sign test.
+    """
+    rows = [["report", "won", "lost", "episodes", "p"]]
+    for name in REPORTS:
+        outcomes = []
+        for pair in zip(runs_of(results, one), runs_of(results, other)):
+            columns = [measured(run, name, "after") or measured(run, name) for run in pair]
+            if all(columns):
+                outcomes += [p for task in columns[0] for p in zip(*(c[task] for c in columns))]
+        if outcomes:
+            won, lost = outcomes.count((True, False)), outcomes.count((False, True))
+            p = binomtest(won, won + lost).pvalue if won + lost else 1.0
+            rows.append([name, str(won), str(lost), str(len(outcomes)), f"{p:.4f}"])
+    return format_table(rows)
+
+
 def ship(checkpoint: str) -> None:
     """Writes assets/ml10-small.pt: a checkpoint in float16 that is rolled out as `small` is."""
     small = asdict(PRESETS["small"])
@@ -409,6 +428,8 @@ def main(words: list[str]) -> None:
     if words[:1] == ["--ship"]:
         return ship(words[1])
     results = json.loads(RESULTS.read_text())
+    if words[:1] == ["--compare"]:
+        return print(compare(results, *words[1:]))
     for folder in words:
         take(results, Path(folder))
     if words:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from report import wilson_interval
-from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, fill, runs_of
+from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
 from tests.runs import VARIANTS
 
 HELD = json.loads(RESULTS.read_text())
@@ -30,6 +30,17 @@ def test_a_cell_can_be_recomputed_from_the_episodes(report, column, task):
     line = next(line for line in page.splitlines() if re.match(rf"\| {task} +\|", line))
     shown = re.search(r"([\d.]+) \[([\d.]+), ([\d.]+)\]", line).groups()  # DAMI comes first
     assert [float(x) for x in shown] == pytest.approx(expected, abs=0.051)
+
+
+def test_a_comparison_counts_what_is_won_and_lost_on_the_same_goals():
+    def run(base, after):
+        novel = {"before": {"push": "1111111"}, "after": {"push": after}}
+        return {"base": {"successes": {"last": {"reach": base}}}, "novel": {"successes": novel}}
+
+    results = {"a-seed0": run("1100", "1111111"), "b-seed0": run("1011", "0000001")}
+    rows = [line.split("|")[1:-1] for line in compare(results, "a", "b").splitlines()[2:]]
+    rows = [[cell.strip() for cell in row] for row in rows]
+    assert rows == [["base", "1", "2", "4", "1.0000"], ["novel", "6", "0", "7", "0.0312"]]
 
 
 def test_runs_are_of_the_variants_that_they_name():

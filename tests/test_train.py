@@ -488,6 +488,14 @@ def test_a_run_of_an_older_version_which_lacks_a_setting_is_resumed(run, recorde
         train.main([*argv, "--resume", "--held-out", "1"])
 
 
+def test_threads_are_as_many_as_were_asked_for():
+    asked = torch.get_num_threads() + 1
+    scripts.pick_device("cpu", asked)
+    assert torch.get_num_threads() == asked
+    scripts.pick_device("cpu")
+    assert torch.get_num_threads() == asked  # left as they are
+
+
 def test_what_concerns_the_inner_step_may_differ_before_the_first_one(run, recorded, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     argv = [*FEW, "--data", str(recorded), "--out", str(tmp_path / "run"), "--resume"]
