@@ -65,6 +65,10 @@ def test_the_tutorials_outputs_are_committed_as_it_ran():
     kinds = [kind for cell in code for output in cell.outputs for kind in output.get("data", {})]
     assert kinds.count("image/gif") == 1  # the rollout
     assert any("animation" in str(cell.outputs) for cell in code)  # the cloud to be turned
+    for cell in code:  # a progress bar as it ended, not as it went
+        streams = [output for output in cell.outputs if output.output_type == "stream"]
+        assert len({stream.name for stream in streams}) == len(streams)
+        assert "\r" not in "".join(stream.text for stream in streams)
 
 
 def test_a_section_of_the_tutorial_needs_the_set_up_and_nothing_else():
