@@ -82,8 +82,10 @@ ABLATION = {  # a row of the paper's ablation -> our variant, and what it is
     "+tcfm-mid": ("mid", "VMT, TCFM in the middle"),
     "+tcfm-up": ("up", "VMT, TCFM in the last up-sampling level"),
 }
-COLUMNS = {"dami": "DAMI", "no-inner-loop": "no inner loop", "neither": "multi-task"}
+COLUMNS = {"dami": "DAMI", "no-inner-loop": "no inner loop"}
+COLUMNS |= {"no-demonstration": "no demonstration", "neither": "multi-task"}
 SHOWN = {suite: {f"{suite}-{v}": title for v, title in COLUMNS.items()} for suite in TASKS}
+del SHOWN["ml45"]["ml45-no-demonstration"]
 SHOWN["ml45"]["ml45-dp3"] = "DP3"
 REPORT = {"base": ("base", 0), "novel": ("novel", "after")}  # what measures the tasks of a split
 
@@ -399,14 +401,16 @@ def draw_by_task(results: dict, path: Path) -> None:
 
 
 def compare(results: dict, one: str, other: str) -> str:
-    """Episodes on the same goals that one variant wins and loses against another, run by run.
+    """Episodes on the same goals that one variant wins and loses against another, seed by seed.
 
     A row a report that both have, of its column "after" or else its first; p: two-sided sign test.
     """
     rows = [["report", "won", "lost", "episodes", "p"]]
+    names = [name for name in results if name.startswith(f"{one}-seed")]
+    pairs = [(results[name], results.get(name.replace(one, other, 1), {})) for name in names]
     for name in REPORTS:
         outcomes = []
-        for pair in zip(runs_of(results, one), runs_of(results, other)):
+        for pair in pairs:
             columns = [measured(run, name, "after") or measured(run, name) for run in pair]
             if all(columns):
                 outcomes += [p for task in columns[0] for p in zip(*(c[task] for c in columns))]

@@ -38,6 +38,7 @@ def test_a_comparison_counts_what_is_won_and_lost_on_the_same_goals():
         return {"base": {"successes": {"last": {"reach": base}}}, "novel": {"successes": novel}}
 
     results = {"a-seed0": run("1100", "1111111"), "b-seed0": run("1011", "0000001")}
+    results |= {"a-seed1": run("1111", "1111111"), "b-seed2": run("0000", "0000000")}  # no pair
     rows = [line.split("|")[1:-1] for line in compare(results, "a", "b").splitlines()[2:]]
     rows = [[cell.strip() for cell in row] for row in rows]
     assert rows == [["base", "1", "2", "4", "1.0000"], ["novel", "6", "0", "7", "0.0312"]]
