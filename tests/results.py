@@ -48,6 +48,7 @@ DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022); the
 VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-dami": "DAMI",
     "ml10-first-order": "DAMI, first order",
+    "ml10-first-order-3e-2": "DAMI, first order, with an inner rate of 3e-2",
     "ml10-no-inner-loop": "without the inner loop",
     "ml10-no-inner-loop-cpu": "without the inner loop, trained on two cores",
     "ml10-mlp": "without the inner loop, an MLP for VMT",

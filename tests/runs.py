@@ -27,6 +27,7 @@ VARIANTS = {
     "neither": "--demo-encoder none --maml off",
     "30-demonstrations": "--demo-encoder none --maml off --demonstrations 30 --data data30",
     "first-order": "--maml first",
+    "first-order-3e-2": "--maml first --inner-lr 3e-2",
     "inner-3e-2": "--inner-lr 3e-2",
     "no-dropout": "--instruction-dropout 0",
     "more-dropout": "--instruction-dropout 0.5",
