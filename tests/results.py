@@ -83,11 +83,20 @@ ABLATION = {  # a row of the paper's ablation -> our variant, and what it is
     "+tcfm-mid": ("mid", "VMT, TCFM in the middle"),
     "+tcfm-up": ("up", "VMT, TCFM in the last up-sampling level"),
 }
-COLUMNS = {"dami": "DAMI", "no-inner-loop": "no inner loop"}
-COLUMNS |= {"no-demonstration": "no demonstration", "neither": "multi-task"}
-SHOWN = {suite: {f"{suite}-{v}": title for v, title in COLUMNS.items()} for suite in TASKS}
-del SHOWN["ml45"]["ml45-no-demonstration"]
-SHOWN["ml45"]["ml45-dp3"] = "DP3"
+SHOWN = {  # a suite -> the columns of its tables: a variant, and what it is called there
+    "ml10": {
+        "ml10-dami": "DAMI",
+        "ml10-no-inner-loop": "no inner loop",
+        "ml10-no-demonstration": "no demonstration",
+        "ml10-neither": "multi-task",
+    },
+    "ml45": {
+        "ml45-dami": "DAMI",
+        "ml45-no-inner-loop": "no inner loop",
+        "ml45-neither": "multi-task",
+        "ml45-dp3": "DP3",
+    },
+}
 REPORT = {"base": ("base", 0), "novel": ("novel", "after")}  # what measures the tasks of a split
 
 

@@ -9,6 +9,7 @@ import pytest
 from report import wilson_interval
 from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
 from tests.runs import VARIANTS
+from train import SETTINGS
 
 HELD = json.loads(RESULTS.read_text())
 
@@ -62,6 +63,13 @@ def test_runs_are_of_the_variants_that_they_name():
         always_told = arguments.get("instruction_dropout", 0) == 0
         assert always_told == (variant.startswith("before") or silent)
         assert variant in VARIANTS or variant.startswith("before")
+        flags = VARIANTS.get(variant, "").replace("--data data30", "").split()
+        flags = dict(zip(flags[::2], flags[1::2]))
+        if variant in VARIANTS and arguments["maml"] != "off":
+            flags.setdefault("--inner-lr", SETTINGS["small"].inner_lr)
+        for flag, value in flags.items():
+            used = (arguments | config).get(flag[2:].replace("-", "_"), "dami")
+            assert used == type(used)(value), (name, flag)
 
 
 def test_every_result_says_how_it_was_measured():

@@ -488,7 +488,7 @@ def test_a_run_of_an_older_version_which_lacks_a_setting_is_resumed(run, recorde
         train.main([*argv, "--resume", "--held-out", "1"])
 
 
-def test_threads_are_as_many_as_were_asked_for():
+def test_threads_are_as_many_as_were_asked_for(own_folder):
     asked = torch.get_num_threads() + 1
     scripts.pick_device("cpu", asked)
     assert torch.get_num_threads() == asked
