@@ -106,7 +106,10 @@ def read_lerobot(
         refuse(path, f"it lacks {', '.join(missing)}; it holds {', '.join(features)}")
     seen = choose_feature(path, features, feature)
     parts = {"points": seen, "state": "observation.state", "action": "action"}
-    lens = next((name for name in features if "intrinsics" in name), None)
+    lenses = [] if camera["intrinsics"] else [name for name in features if "intrinsics" in name]
+    if len(lenses) > 1:
+        refuse(path, f"has the lenses {', '.join(lenses)}: write one's intrinsics to --camera")
+    lens = next(iter(lenses), None)
     index = ["episode_index", "task_index"]
 
     # Frame by frame, since the depth of a whole dataset need not fit into memory
@@ -148,12 +151,18 @@ def choose_feature(path: Path, features: dict[str, Any], chosen: str | None) -> 
     """The cloud or depth to read; ValueError, with what there is, if that is not clear."""
     arrays = {k: f for k, f in features.items() if f["dtype"] not in ("video", "image", "string")}
     square = [k for k, f in arrays.items() if sum(n > 1 for n in f["shape"]) == 2]
-    clouds = [name for name in square if re.search("point|cloud", name)]
-    found = [chosen] if chosen else clouds or [name for name in square if "depth" in name]
-    if len(found) != 1 or found[0] not in square:
+    clouds = [name for name in square if is_cloud(name)]
+    depths = [name for name in square if "depth" in name and not is_cloud(name)]
+    found = [name for name in clouds + depths if name == chosen] if chosen else clouds or depths
+    if len(found) != 1:
         there = ", ".join(f"{name} ({f['dtype']})" for name, f in features.items())
-        refuse(path, f"name the array of clouds or depth with --feature; it holds {there}")
+        what = "whose name says `cloud`, `point` or `depth`"
+        refuse(path, f"name the array, {what}, with --feature; it holds {there}")
     return found[0]
+
+
+def is_cloud(name: str) -> bool:
+    return re.search("point|cloud", name) is not None
 
 
 def flat(path: Path, features: dict[str, Any], batch: Any, name: str) -> np.ndarray:
@@ -178,7 +187,7 @@ def pixels(intrinsics: np.ndarray) -> list[float]:
 
 def to_points(path: Path, x: np.ndarray, camera: dict, points: int, seen: str) -> np.ndarray:
     """A cloud (N, 3 or more), or depth (H, W), -> (points, 3) float16, farthest points."""
-    if "depth" not in seen:
+    if is_cloud(seen):
         return farthest_point_sample(np.float32(x.reshape(-1, x.shape[-1])[:, :3]), points)
     if len(camera["intrinsics"] or ()) != 4:
         refuse(path, f"{seen} needs the camera's fx, fy, cx, cy: write them to --camera")
@@ -199,6 +208,20 @@ def read_tasks(path: Path, parquet: Any) -> dict[int, str]:
     return {line["task_index"]: line["task"] for line in map(json.loads, lines)}
 
 
+def read_camera(path: Path) -> dict[str, Any]:
+    """What the file of --camera says; ValueError for what `CAMERA` does not have."""
+    given = read_json(path)
+    for name, value in given.items():
+        shape = (4,) if name == "intrinsics" else np.shape(CAMERA.get(name, ""))
+        try:
+            numbers = np.array(value, np.float64)
+        except (TypeError, ValueError):
+            numbers = np.zeros(0)
+        if name not in CAMERA or numbers.shape != shape or not np.isfinite(numbers).all():
+            refuse(path, f"{name} is none of {', '.join(CAMERA)}, or not numbers of its shape")
+    return given
+
+
 def read_json(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text()))
@@ -216,7 +239,7 @@ def import_recordings(args: argparse.Namespace) -> list[Path]:
     if not path.exists():
         refuse(path, "is missing: look at --import")
     if (path / "meta" / "info.json").is_file():
-        camera = CAMERA | (read_json(Path(args.camera)) if args.camera else {})
+        camera = CAMERA | (read_camera(Path(args.camera)) if args.camera else {})
         found = read_lerobot(path, args.instruction, args.num_points, camera, args.feature)
     else:
         found = read_zarr(path, args.instruction, args.num_points)

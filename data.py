@@ -103,7 +103,11 @@ class Demonstrations:
             return f"positions_in_state is {positions!r}, a state has {self.state.shape[1]} numbers"
         if positions and self.action.shape[1] < 3:
             return "with positions_in_state an action must begin with a displacement"
-        if np.shape(self.meta.get("workspace") or np.zeros((2, 3))) != (2, 3):
+        try:
+            box = np.array(self.meta.get("workspace") or np.zeros((2, 3)), np.float64)
+        except (TypeError, ValueError):
+            box = np.zeros(0)
+        if box.shape != (2, 3) or not np.isfinite(box).all():
             return "workspace must be two corners of three numbers, metres"
         frames = self.meta.get("success_frames", [0] * len(ends))
         listed = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
@@ -246,6 +250,7 @@ class WindowSampler:
         self.positions = meta.get("positions_in_state", 0) if augment else 0
         box = meta.get("workspace") or [points.min((0, 1)).tolist(), points.max((0, 1)).tolist()]
         self.middle = torch.tensor(box).float().mean(dim=0, keepdim=True)  # (1, 3) turned about
+        self.limit = max(1.0, float(self.action[:, :3].abs().max()))  # of a displacement
 
         successes = meta.get("success_frames", []) if after_success is not None else []
         windows, counts = [], []
@@ -339,7 +344,7 @@ class WindowSampler:
         at = 3 * self.positions
         positions = place(state[..., :at].unflatten(-1, (-1, 3))).flatten(-2)  # (n, T, at)
         state = torch.cat([positions, state[..., at:]], dim=-1)
-        displacement = (action[..., :3] @ a.mT).clamp(-1, 1)  # (n, T', 3)
+        displacement = (action[..., :3] @ a.mT).clamp(-self.limit, self.limit)  # (n, T', 3)
         action = torch.cat([displacement, action[..., 3:]], dim=-1)
         return dict(zip(names, (place(points), state, action)))
 

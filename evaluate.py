@@ -60,10 +60,11 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
     """
     finished = []
     for config in Path(runs).glob("*/config.json"):
-        arguments = json.loads(config.read_text()).get("arguments", {})
-        last = config.parent / f"ema-{arguments.get('steps', 0):05d}.pt"
-        if arguments.get("suite") == suite and arguments["preset"] != "tiny" and last.is_file():
-            finished.append(last)
+        with suppress(OSError, ValueError, KeyError, TypeError):  # of a damaged file
+            arguments = json.loads(config.read_text())["arguments"]
+            last = config.parent / f"ema-{arguments['steps']:05d}.pt"
+            if arguments["suite"] == suite and arguments["preset"] != "tiny" and last.is_file():
+                finished.append(last)
     if finished:
         return max(finished, key=lambda path: path.stat().st_mtime)
     if suite != "ml10" or not SHIPPED_CHECKPOINT.is_file():
@@ -151,7 +152,6 @@ def rollout(
         )  # (E, Ta, A)
 
         for e, chunk in zip(list(running), chunks):
-            frames[e] = []
             for step, action in enumerate(chunk, start=1):
                 _, truncated, info = envs[e].advance(action)
                 success[e] = success[e] or info["success"]
@@ -159,7 +159,7 @@ def rollout(
                     running.remove(e)
                     break
                 if step > len(chunk) - To:
-                    frames[e].append(envs[e].observe())
+                    frames[e] = [*frames[e], envs[e].observe()][-To:]
     return success
 
 
@@ -553,6 +553,8 @@ def main(argv: list[str] | None = None) -> None:
     tasks = choose_tasks(args, suite, info)
     if args.gif and len(tasks) > 1:
         raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
+    if args.gif and (args.known_goals or "demonstration" in args.without):
+        raise ValueError("--gif: leave out --known-goals, and --without demonstration")
     if args.gif and "adapted_to" not in info and tasks[0] in suite_tasks(suite)[1]:
         adapt = f"python finetune.py --task {tasks[0]}"
         print(f"{tasks[0]} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
@@ -568,12 +570,15 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError(f"{checkpoint} was adapted to {each['adapted_to']}: measure it alone")
     out = Path(args.out)
     with nullcontext() if args.gif else scripts.locked(out):
-        if not args.gif:
-            scripts.claim_folder(out, args.overwrite)
+        old = [] if args.gif else scripts.claim_folder(out, args.overwrite)
         paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
         n, how = args.demonstrations, (args.clip_weights, info["text_weights"], device)
         recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
         text, identity = scripts.instruction_features(recorded, *how)
+        if "instruction" in args.without or not info.get("adaptation", {}).get("instruction", True):
+            text = {task: torch.zeros_like(feature) for task, feature in text.items()}
+        for file in old:
+            file.unlink()
 
         if args.gif:
             sampler = WindowSampler(recorded[tasks[0]], policy.config, device)
@@ -581,15 +586,14 @@ def main(argv: list[str] | None = None) -> None:
             print(f"{tasks[0]}: {'success' if success else 'failure'}; wrote {args.gif}")
             return
 
-        facts = {"title": " ".join(args.task or []) or f"{suite}, {args.split} tasks"}
+        chosen = args.task or "adapted_to" in info
+        facts = {"title": " ".join(tasks) if chosen else f"{suite}, {args.split} tasks"}
         facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
         facts |= scripts.report_facts("evaluate.py", argv, device) | changed
         if args.known_goals:
             facts["goals"] = "of the demonstrations, each once"
         if args.without:
             facts["without"] = " and ".join(args.without)
-        if "instruction" in args.without:
-            text = {task: torch.zeros_like(feature) for task, feature in text.items()}
         measure(args, suite, runs, labels, paths, text, device, facts)
 
 

@@ -179,7 +179,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Adapts a policy to one task (Algorithm 2).")
     add = parser.add_argument_group("run").add_argument
     add("--task", nargs="+", help="tasks of Meta-World, or `novel`: the novel ones of the suite")
-    add("--suite", default="ml10", help="of the run to start from, and of `novel` (default: ml10)")
+    add("--suite", help="of the run to start from, and of `novel` (default: the run's, or ml10)")
     add("--data", default="data", help="folder of the demonstrations, or one file (default: data)")
     add("--checkpoint", help="file or run folder to start from (default: the newest run's last)")
     add("--curve", nargs="+", type=int, default=[], help="roll out after these steps, too")
@@ -207,14 +207,16 @@ def main(argv: list[str] | None = None) -> None:
         tasks, simulated = [recorded.task], is_simulated(recorded, file)
         if args.task not in (None, tasks):
             raise ValueError(f"{file} is a recording of {tasks[0]}, not of {args.task[0]}")
-    elif args.task == ["novel"]:
-        tasks = suite_tasks(args.suite)[1]
-    else:
+    elif args.task != ["novel"]:
         tasks = [check_task(task) for task in args.task]
-    start = args.checkpoint or evaluate.default_checkpoint(args.suite if simulated else "own")
-    checkpoint = scripts.checkpoints_of(start)[-1]
+    if args.suite:
+        suite_tasks(args.suite)  # refuses a wrong one now
+    suite = args.suite or "ml10" if simulated else "own"
+    checkpoint = scripts.checkpoints_of(args.checkpoint or evaluate.default_checkpoint(suite))[-1]
     changed = scripts.inference(args)
     _, info = load_checkpoint(checkpoint, needs=evaluate.TRAINED, **changed)
+    if args.task == ["novel"]:
+        tasks = suite_tasks(args.suite or info["suite"])[1]
     where = f"{device} ({scripts.hardware(device)})"
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {where}", flush=True)
 
@@ -226,14 +228,19 @@ def main(argv: list[str] | None = None) -> None:
         settings = replace(settings, demonstrations=settings.demonstrations or 10)
 
     with scripts.locked(folder):
-        for path in {folder, *folders.values()}:
-            scripts.claim_folder(path, args.overwrite)
+        claimed = {folder, *folders.values()}
+        old = [file for path in claimed for file in scripts.claim_folder(path, args.overwrite)]
+        if checkpoint.resolve() in [path.resolve() for path in old]:
+            raise ValueError(f"{checkpoint} itself would be overwritten: choose another --out")
         paths = {tasks[0]: file}
         if file is None:
             paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
-        recorded = {task: load_demonstrations(paths[task]) for task in tasks}
-        how = args.clip_weights, info["text_weights"], device
+        n, how = settings.demonstrations, (args.clip_weights, info["text_weights"], device)
+        recorded = {task: load_demonstrations(paths[task]).take(n) for task in tasks}
+        evaluate.hold_out(recorded, settings.held_out)  # refuses too many now
         text, identity = scripts.instruction_features(recorded, *how, told=settings.instruction)
+        for file in old:
+            file.unlink()
 
         # Each task before, in between if asked for, and after
         between = sorted({step for step in args.curve if 0 < step < settings.steps})

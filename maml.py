@@ -101,8 +101,8 @@ def meta_gradient(
         losses.append(of_chunk.detach())
         if total is None:
             total = gradients
-        else:
-            total = {name: total[name].add_(g) for name, g in gradients.items()}
+        else:  # not in place: two gradients may be one tensor
+            total = {name: total[name] + g for name, g in gradients.items()}
     if total is None:
         raise ValueError("meta_gradient needs at least one task")
     after, before = torch.cat(losses).unbind(dim=1)

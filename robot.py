@@ -116,6 +116,11 @@ class Settings:
         moved = np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3)
         if not moved or np.linalg.det(pose) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
             self.refuse("camera_to_base", "its 3 x 3 must be a rotation, its last row 0 0 0 1")
+        for unit in ("m", "rad"):  # at full speed a healthy arm lags by this much
+            lag = getattr(self, f"max_speed_{unit}_s") * self.servo_lookahead_s
+            if lag > 0.9 * getattr(self, f"max_lag_{unit}"):
+                why = f"at max_speed_{unit}_s the arm lags by {lag:.3f}: allow more, or be slower"
+                self.refuse(f"max_lag_{unit}", why)
         if self.start_pose and (reason := refusal([np.array(self.start_pose)], self)):
             self.refuse("start_pose", reason)
 
@@ -376,12 +381,20 @@ def port_of(host: str, port: int, what: str) -> Iterator[socket.socket]:
         raise RobotError(f"{what} at {host}:{port} does not answer: {error}") from None
 
 
-def upload(host: str, port: int, text: str) -> None:
-    """Sends a URScript program; the controller ends the one that runs and starts this one."""
+def upload(host: str, port: int, text: str, waiting: Callable = lambda: None) -> None:
+    """Sends a URScript program; the controller ends the one that runs and starts this one.
+
+    Until the port has answered, `waiting` is called again and again: the program may run already.
+    """
     with port_of(host, port, "the script port") as connection:
         connection.sendall(text.encode())
-        received = 0
+        received, deadline = 0, time.monotonic() + 2
         while received < 79:  # one that closes without having read may have its program discarded
+            waiting()
+            if not select.select([connection], [], [], 0.01)[0]:
+                if time.monotonic() > deadline:
+                    raise OSError("it says nothing")
+                continue
             received += len(part := connection.recv(4096))
             if not part:
                 raise OSError("it closed the connection")
@@ -593,6 +606,8 @@ class RecordedCamera:
                 depth, self.intrinsics = file["depth"], tuple(map(float, file["intrinsics"]))
             if depth.ndim != 3 or not depth.size or depth.dtype != np.uint16:
                 raise TypeError(f"depth is {depth.dtype} {depth.shape}")
+            if len(self.intrinsics) != 4:
+                raise TypeError(f"intrinsics are {len(self.intrinsics)} numbers")
         except Exception as error:  # numpy and zipfile raise many types
             what = "no recorded camera: depth (F, H, W) uint16, intrinsics (4,) in an .npz file"
             raise ValueError(f"{path} is {what} ({error})") from None
@@ -639,12 +654,18 @@ def toward(pose: np.ndarray, target: np.ndarray, most: np.ndarray) -> np.ndarray
     return compose(pose, step * np.repeat(np.minimum(1, most / lengths(step).clip(1e-12)), 3))
 
 
-def refusal(poses: Sequence[np.ndarray], settings: Settings) -> str | None:
-    """Why an arm must not go through these poses (6,), one every 1 / policy_hz; None if it may."""
-    for pose, later in itertools.pairwise(poses):
-        metres, radians = lengths(difference(pose, later))
+def jump(steps: Sequence[np.ndarray], settings: Settings) -> str | None:
+    """Which of these steps (6 or 7,) is too far for one of 1 / policy_hz; None if none is."""
+    for metres, radians in map(lengths, steps):
         if metres > settings.max_step_m or radians > settings.max_step_rad:
             return f"a step jumps by {metres:.3f} m, {radians:.3f} rad (max_step_m, max_step_rad)"
+    return None
+
+
+def refusal(poses: Sequence[np.ndarray], settings: Settings) -> str | None:
+    """Why an arm must not go through these poses (6,), one every 1 / policy_hz; None if it may."""
+    if reason := jump([difference(*pair) for pair in itertools.pairwise(poses)], settings):
+        return reason
     for x in (pose[:3] for pose in poses):
         if ((x < settings.tcp_low_m) | (x > settings.tcp_high_m)).any():
             return f"the TCP is outside its box, at {', '.join(f'{i:.3f}' for i in x)} m"
@@ -678,15 +699,17 @@ class Servo:
 
     DELAY = 0.025  # seconds from measuring a pose to following the answer
     PATIENCE = 5.0  # seconds for the program to start
+    SLOW = "the policy or the camera is too slow"
 
     def __init__(self, rtde: RTDE, settings: Settings, moves: bool = True, free: bool = False):
         self.rtde, self.settings, self.moves, self.free = rtde, settings, moves, free
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
+        self.sent = self.pose  # that, held back
         most, ahead = (settings.max_speed_m_s, settings.max_speed_rad_s), settings.servo_lookahead_s
         self.lead = np.array(most) * ahead  # (2,) metres, radians
         self.speed = self.lead / (ahead + self.DELAY)  # (2,) a second, of the targets
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
-        self.missing = "the policy or the camera is too slow"  # why the arm holds
+        self.missing = self.SLOW  # why the arm holds
         self.lock, self.error, self.ended = threading.Lock(), None, threading.Event()
         self.changed: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
         self.lateness, self.ages, self.clamped, self.slowed = [], [], 0, 0
@@ -705,13 +728,17 @@ class Servo:
                 raise RobotError(f"the arm is not moved: {reason}")
             if not self.moves or self.rtde.program_runs(state):
                 break
-            self.rtde.send(self.pose)
+            self.send(self.pose)
             if turn == 0:
                 text = program(self.rtde.session, settings, self.free)
-                upload(host, settings.script_port, text)
+                upload(host, settings.script_port, text, lambda: self.send(self.pose))
             time.sleep(1 / settings.servo_hz)
         self.held_since = time.monotonic()
         self.thread.start()
+
+    def send(self, pose: np.ndarray) -> None:
+        self.sent = pose
+        self.rtde.send(pose)
 
     def follow(self, actions: np.ndarray) -> None:
         """Takes relative actions (n, 7), one every 1 / policy_hz from now on, or stops the arm."""
@@ -720,6 +747,8 @@ class Servo:
             self.fail(f"actions have the shape {actions.shape}, not (n, {ACTION_DIM})")
         elif not np.isfinite(actions).all():
             self.fail("an action is not finite")
+        elif reason := jump(actions, settings):  # as asked: clamped to the box, it may be none
+            self.fail(reason)
         self.check()
         with self.lock:
             poses, now = [self.pose], time.monotonic()
@@ -777,7 +806,7 @@ class Servo:
                     return self.fail(reason)
                 pose = state.pose if self.free else self.tick(now)
                 if self.moves:
-                    self.rtde.send(toward(state.pose, pose, self.lead))
+                    self.send(toward(state.pose, pose, self.lead))
                 self.lateness.append(now - due)
                 self.ages.append(now - state.received)
                 due = max(due + period, now - period)  # no burst to catch up after a pause
@@ -820,7 +849,7 @@ class Servo:
         self.error = self.error or reason
         with suppress(RobotError):  # a lost connection: the watchdog on the controller stops it
             if self.moves:
-                self.rtde.send(self.pose, stop=True)
+                self.rtde.send(self.sent, stop=True)  # nothing new to follow
 
     def stop(self) -> None:
         """Ends the stream and the program on the controller, and says if that goes on."""
@@ -879,6 +908,8 @@ class Cell:
                 servo.missing = str(error)
                 servo.check()
                 time.sleep(0.02)
+        if servo is not None:
+            servo.missing = Servo.SLOW
         pose = self.rtde.state(self.settings.max_state_age_s).pose
         pose[3:] = nearer(pose[3:], np.array(self.settings.rotation_near_rad))
         state = np.append(pose, self.gripper.read()).astype(np.float32)
@@ -889,6 +920,7 @@ class Cell:
         v, settings = self.rtde.state(self.settings.max_state_age_s).values, self.settings
         now = {"policy_hz": float(settings.policy_hz), "payload_kg": round(float(v["payload"]), 3)}
         now["tcp_offset"] = v["tcp_offset"].round(4).tolist()
+        now["rotation_near_rad"] = list(map(float, settings.rotation_near_rad))
         for name, value in now.items():
             if recording and (found := recording.meta.get(name, value)) != value:
                 made = f"{recording.task} was recorded with {name} {found}"
@@ -954,8 +986,11 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
         what = f"{args.checkpoint} has {needed} dimensions of state and action, and points"
         raise ValueError(f"{what}, the robot {mine}: use a policy trained on its recordings")
     recording = data.load_demonstrations(args.data)
+    if (task := info.get("adapted_to", recording.task)) != recording.task:
+        raise ValueError(f"{args.checkpoint} was adapted to {task}, {args.data} is of another task")
     sampler = data.WindowSampler(recording, config, args.device)
     text, _ = text_features([recording.instruction], args.clip_weights, info["text_weights"])
+    text = text * info.get("adaptation", {}).get("instruction", True)  # zeros: adapted without it
     torch.set_num_threads(max(1, (os.cpu_count() or 1) - 1))  # a core is left to the servo stream
     generator = torch.Generator().manual_seed(args.seed)
     demo = sampler.demonstration(sampler.draw_episode(generator))  # held for the whole run
@@ -981,7 +1016,10 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
 def replay(args: argparse.Namespace, settings: Settings) -> None:
     """Goes slowly to where a recorded episode began, and executes its actions."""
     recording = data.load_demonstrations(args.data)
-    if not 0 <= args.episode < len(recording) or recording.state.shape[1] != STATE_DIM:
+    dims = recording.state.shape[1], recording.action.shape[1]
+    if dims != (STATE_DIM, ACTION_DIM):
+        raise ValueError(f"{args.data} has {dims} dimensions of state and action: of another robot")
+    if not 0 <= args.episode < len(recording):
         raise ValueError(f"{args.data} has {len(recording)} episodes: no --episode {args.episode}")
     frames = recording.episode(args.episode)
     actions = recording.action[frames]  # (T, A)
@@ -1083,6 +1121,8 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
     kept = data.load_demonstrations(out) if out.exists() else None
     if kept and (kept.task, kept.instruction) != (args.task, args.instruction):
         raise ValueError(f"{out} holds {kept.task}, {kept.instruction!r}: use another --out")
+    if kept and (n := kept.points.shape[1]) != settings.num_points:
+        raise ValueError(f"{out} has clouds of {n} points: set num_points so, or use another --out")
     moves, count, due, frames, grip = not args.dry_run, 0, time.monotonic(), None, []
     with scripts.locked(out.parent), connect(args, settings, write=moves) as cell, Keys() as keys:
         meta = cell.made_with(kept) | boxes(settings) | {"made_by": "robot.record"}
@@ -1138,9 +1178,9 @@ def finish(frames: list[Frame], grip: list[float], settings: Settings) -> tuple[
     poses = [frame.state[:6].astype(float) for frame in frames]
     moves = [difference(*pair) for pair in itertools.pairwise(poses)] + [np.zeros(6)]
     problem, times = refusal(poses, settings), [frame.time for frame in frames]
-    gap = max(np.diff(times), default=0)
-    if gap > 2 / settings.policy_hz:
-        problem = f"two frames are {gap:.2f} s apart, camera or gripper were late"
+    gap, mean = max(np.diff(times), default=0), np.mean(np.diff(times)) if times[1:] else 0
+    if gap > 2 / settings.policy_hz or mean > 1.2 / settings.policy_hz:  # replay would be faster
+        problem = f"frames are {mean:.2f}, up to {gap:.2f} s apart, camera or gripper were late"
     return np.column_stack([moves, grip]), problem and f"dropped: {problem}"
 
 

@@ -371,16 +371,12 @@ def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **
     config = {name: list(v) if isinstance(v, tuple) else v for name, v in config.items()}
     content = {"format": CHECKPOINT_FORMAT, "config": config, "model": weights, **info}
 
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
     try:
-        torch.save(content, temporary)
-        os.replace(temporary, path)
+        write_atomically(path, lambda temporary: torch.save(content, temporary))
     except RuntimeError as error:  # how torch.save reports a full disk
         free = shutil.disk_usage(path.parent).free / 1e6  # MB
         advice = "make room" if free < 1000 else "look at its permissions and at `ulimit -f`"
         raise OSError(f"cannot write {path}, {free:.0f} MB are free there: {advice}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def checkpoints_of(path: str | Path) -> list[Path]:
@@ -388,7 +384,8 @@ def checkpoints_of(path: str | Path) -> list[Path]:
     path = Path(path)
     if not path.is_dir():
         return [path]
-    if not (found := sorted(path.glob("ema-*.pt")) or sorted(path.glob("adapted.pt"))):
+    by_step = sorted(path.glob("ema-*.pt"), key=lambda file: (len(file.name), file.name))
+    if not (found := by_step or sorted(path.glob("adapted.pt"))):
         inside = ", ".join(str(file.parent) for file in sorted(path.glob("*/adapted.pt")))
         instead = inside or "a folder of train.py or finetune.py, or a .pt file"
         raise ValueError(f"{path} holds no checkpoint: name {instead}")
@@ -440,6 +437,8 @@ def digest(samplers: dict[str, WindowSampler]) -> str:
     sha = hashlib.sha256()
     for sampler in samplers.values():
         sha.update(f"{sampler.task} {sampler.instruction}".encode())
+        if sampler.positions:  # scenes are moved about
+            sha.update(f"{sampler.positions} {sampler.middle.tolist()}".encode())
         for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
             sha.update(part.cpu().numpy().tobytes())
     return sha.hexdigest()
@@ -496,11 +495,11 @@ RESULTS = "adapted.pt", "adapted-*.pt", "success.json", "success.md", "success.p
 OF_ADAPTING = "config.json", "metrics.jsonl", "events.out.tfevents.*"
 
 
-def claim_folder(folder: Path, overwrite: bool) -> None:
+def claim_folder(folder: Path, overwrite: bool) -> list[Path]:
     """Makes a folder for results; ValueError if there are any, or a run, that would be lost.
 
-    With `overwrite` old results go, so that none of them stands beside new ones. A training run
-    is never overwritten.
+    With `overwrite` returns the old results. They are to go, so that none of them stands beside new
+    ones, once nothing more can be refused. A training run is never overwritten.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.glob("ema-*.pt")) or (folder / "last.pt").exists():
@@ -508,8 +507,7 @@ def claim_folder(folder: Path, overwrite: bool) -> None:
     old = [path for name in RESULTS + OF_ADAPTING for path in folder.glob(name)]
     if old and not overwrite:
         raise ValueError(f"{folder} already holds {old[0].name}: add --overwrite, or another --out")
-    for path in old:
-        path.unlink()
+    return old
 
 
 def check_run(folder: Path, resume: bool) -> None:
@@ -546,6 +544,8 @@ def remove_temporaries(folder: Path) -> None:
             os.kill(int(temporary.name.split(".")[1]), 0)
         except (ProcessLookupError, ValueError, OverflowError):
             temporary.unlink(missing_ok=True)
+        except PermissionError:
+            pass  # another user's process, which lives
 
 
 def write_text(path: Path, text: str) -> None:
@@ -598,7 +598,7 @@ def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int,
 class StopRequest:
     """Turns Ctrl-C, SIGTERM and a closed terminal into a request to stop after the step at hand.
 
-    A second one stops at once, as does the first within `at_once`.
+    A second one stops at once.
     """
 
     def __enter__(self) -> "StopRequest":
@@ -619,9 +619,16 @@ class StopRequest:
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        self.requested, before = True, self.requested
-        yield
-        self.requested = before
+        """Where all is saved: there a request, one made just before, too, stops at once."""
+        saved = KeyboardInterrupt("all is saved, add --resume to go on")
+        if self.requested:
+            raise saved
+        self.requested = True
+        try:
+            yield
+        except KeyboardInterrupt:
+            raise saved from None
+        self.requested = False
 
 
 def log(folder: Path, **values: Any) -> None:
@@ -671,7 +678,7 @@ def rewind_metrics(folder: Path, step: int) -> None:
     """Drops the lines that a killed run wrote after its last save; all of them for step 0."""
     path = folder / "metrics.jsonl"
     lines = path.read_text().splitlines() if path.exists() else []
-    kept = [line for line in lines if is_whole(line) and json.loads(line)["step"] <= step]
+    kept = [line for line in lines if is_whole(line) and 0 < json.loads(line)["step"] <= step]
     write_text(path, "".join(f"{line}\n" for line in kept))
 
 

@@ -7,9 +7,9 @@
     python train.py --data recordings                   # own tasks: every recording in a folder
     torchrun --nproc-per-node 4 train.py --suite ml10   # tasks shared among 4 processes
 
-Whatever is random in outer step k follows from (seed, k, task) alone. A run that was killed and
-resumed therefore ends with the same bits as one that was not, and tasks may be shared among
-processes without changing what they draw.
+Whatever is random in outer step k follows from (seed, k, task) alone. On a CPU, with as many
+threads, a run that was killed and resumed therefore ends with the same bits as one that was not,
+and tasks may be shared among processes without changing what they draw.
 """
 
 import argparse
@@ -197,8 +197,8 @@ def meta_train(
         rank, world: this process's number, and how many share the tasks.
 
     Yields:
-        (steps done, figures) after each outer step: loss (of the query, after the inner step),
-        gradient_norm, and loss_before (of the query, with the parameters as they were).
+        (steps done, figures) after each outer step: loss and gradient_norm. Where there is an inner
+        step, loss is the query's after it, and loss_before is the query's before it.
 
     Raises:
         ValueError: the loss or its gradient is not finite; this step changed nothing.
@@ -242,7 +242,7 @@ def meta_train(
 
         # The mean over all tasks: the processes' means, weighted by their shares
         if world > 1:
-            for x in (loss, *gradients.values()):
+            for x in (loss, *figures.values(), *gradients.values()):
                 dist.all_reduce(x.mul_(len(my_tasks) / len(samplers)))
         norm = torch.nn.utils.get_total_norm(gradients.values())
         if not torch.isfinite(loss + norm):
@@ -366,10 +366,13 @@ def run(
                 figures["lr"] = optimizer.param_groups[0]["lr"]
                 scripts.log(folder, step=step, **figures, seconds=round(seconds, 2))
 
-                milestone = step == settings.steps or step % settings.checkpoint_every == 0
-                if milestone:
+                every = settings.checkpoint_every, settings.evaluate_every
+                milestone = step == settings.steps or any(step % n == 0 for n in every)
+                if milestone:  # before last.pt: a run that goes on from there lacks none of it
                     checkpoint = folder / f"ema-{step:05d}.pt"
                     save_checkpoint(checkpoint, ema.module, **about, step=step, seconds=seconds)
+                    evaluate.judge(folder, step, ema.module, samplers, unseen, text)
+                    report.draw_curves(folder)
                 if milestone or stop.requested or time.monotonic() - saved > SAVE_SECONDS:
                     now = {"step": step, "seconds": seconds, "data": data}
                     scripts.save_run(folder, policy, ema, optimizer, **about, **now)
@@ -377,9 +380,7 @@ def run(
 
             if stop.requested and step < settings.steps:
                 raise KeyboardInterrupt(f"saved after step {step}, add --resume to go on")
-            if leader and milestone:
-                evaluate.judge(folder, step, ema.module, samplers, unseen, text)
-                report.draw_curves(folder)
+            if leader:
                 evaluate.evaluate_step(folder, step, *how)
             began = time.monotonic()
 

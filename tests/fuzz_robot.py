@@ -36,6 +36,8 @@ def fuzz_robot(seed: int, rounds: int = 8) -> tuple[list[float], list[float], st
             **speeds,
             camera_to_base=np.eye(4, dtype=int).tolist(),
             servo_lookahead_s=rng.uniform(0.03, 0.2),
+            max_lag_m=0.12,
+            max_lag_rad=0.3,
             max_step_m=0.5,
             max_step_rad=3.0,
             max_hold_s=10,

@@ -213,6 +213,7 @@ def without(name):
         (lambda: edit(codebase_version=lambda _: "v1.6"), "", "format v1.6: convert it to v3.0"),
         (lambda: Path("kitchen/meta/info.json").write_text("{"), "", "is no JSON object"),
         (lambda: shutil.rmtree("kitchen/data"), "", "holds no frames"),
+        (lambda: None, "--feature observation.state", "with --feature; it holds"),
         (lambda: None, "--task stir", "holds 2 tasks"),
         (lambda: None, "--instruction Stir.", "leave --instruction out"),
     ],
@@ -222,6 +223,29 @@ def test_a_wrong_dataset_is_refused_in_one_line(damage, options, message, capsys
     damage()
     assert message in fails(convert, ["--import", "kitchen", *options.split()], capsys)
     assert not Path("recordings").exists()
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [{"camera_to_bse": POSE}, {"intrinsics": 600}, {"intrinsics": LENS, "camera_to_base": MATRIX}],
+)
+def test_a_wrong_camera_is_refused_in_one_line(camera, capsys):
+    dataset("kitchen", seen="observation.depth", shape=(12, 16))
+    Path("camera.json").write_text(json.dumps(camera))
+    message = fails(convert, "--import kitchen --camera camera.json".split(), capsys)
+    assert f"camera.json: {list(camera)[-1]} is none of intrinsics, camera_to_base" in message
+
+
+def test_of_two_lenses_none_is_guessed_and_the_file_of_the_camera_comes_first(capsys):
+    depth = np.full((20, 12, 16), 2000, np.uint16)
+    lenses = {f"{side}.intrinsics": np.tile(np.float32(LENS), (20, 1)) for side in ("left", "top")}
+    dataset("kitchen", seen="observation.depth", **{"observation.depth": depth}, **lenses)
+    message = fails(convert, ["--import", "kitchen"], capsys)
+    assert "has the lenses left.intrinsics, top.intrinsics" in message
+    Path("camera.json").write_text(json.dumps({"intrinsics": [80.0, 50.0, 8.0, 6.0]}))
+    convert.main("--import kitchen --num-points 192 --camera camera.json".split())
+    found = load_demonstrations("recordings/pour-the-tea.npz").points
+    assert found[..., 0].max() == pytest.approx((15 - 8) / 80 * 2, abs=1e-3)
 
 
 def test_depth_without_intrinsics_says_where_to_write_them(capsys, monkeypatch):

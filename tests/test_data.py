@@ -174,7 +174,10 @@ BAD_PARTS = [
     ({"state": np.full((30, 9), 1e35)}, "state holds NaN or infinite numbers"),
     ({"points": np.full((30, 16, 3), 900, np.float16)}, "write them in metres"),
     ({"task": "re\0ach"}, "is no name"),
-    (meta(workspace="x"), "workspace must be two corners"),
+    *(
+        (meta(workspace=wrong), "workspace must be two corners")
+        for wrong in ("x", [[0, 0, 0], [1, 1]], [[0, 0, None], [1, 1, 1]], [[0, 0, "x"], [1, 1, 1]])
+    ),
     ({"state": np.array([None, 1], dtype=object)}, "is damaged or no .*: Object arrays"),
     ({"meta": "not json"}, "is damaged or no .*: Expecting"),
     *((meta(success_frames=wrong), "success_frames must") for wrong in ([1], [1, "2"], [1, -1], 1)),
@@ -348,6 +351,11 @@ def test_scenes_are_moved_elsewhere_and_stay_consistent():
     untold = WindowSampler(recorded, SIZES, augment=True).batch(12, seeded())
     assert all(torch.equal(untold[name], x) for name, x in before.items())
 
+    recorded.meta["positions_in_state"] = 2
+    recorded.action[:] *= 100  # in another unit: 50 at most, and so after each map
+    asked = WindowSampler(recorded, SIZES, augment=True).batch(12, seeded())["action"]
+    assert 49 < asked[..., :3].abs().max() <= 50
+
 
 def test_affine_maps_keep_to_their_limits_about_the_middle(monkeypatch):
     middle = torch.tensor([[0.02, 0.65, 0.2]])
@@ -444,6 +452,3 @@ def test_interrupting_ends_with_exit_code_130(capsys):
     with pytest.raises(SystemExit) as end:
         scripts.command_line(lambda: say(KeyboardInterrupt()))
     assert end.value.code == 130 and "interrupted" in capsys.readouterr().err
-
-
-# ---- Backwards -----------------------------------------------------------------------------------

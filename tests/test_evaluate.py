@@ -255,6 +255,9 @@ def test_a_movie_is_written_by_what_is_there(monkeypatch):
 def test_a_folder_stands_for_its_last_checkpoint(run):
     info = scripts.load_checkpoint(run)[1]
     assert info["step"] == 6 and len(scripts.checkpoints_of(run)) == 2
+    for step in (99_000, 100_000):
+        Path(f"ema-{step:05d}.pt").touch()
+    assert scripts.checkpoints_of(".")[-1].name == "ema-100000.pt"
 
 
 TABLE = """
@@ -348,6 +351,7 @@ def test_your_own_simulator_is_rolled_out_in(monkeypatch):
         ("--episodes 0", "--episodes is 0: use at least 1"),
         ("--gif reach.gif", "name its task"),
         ("--task reach --gif reach.avi", "name it .gif or .mp4"),
+        ("--task reach --gif reach.gif --known-goals", "leave out --known-goals"),
         ("--seed -1", "seed"),
         ("--task raech", "did you mean 'reach'?"),
         ("--suite ml-45", "did you mean 'ml45'?"),

@@ -68,6 +68,9 @@ def test_finetuning_needs_only_a_task_and_reports_before_and_after(
     message = fails(finetune, argv, capsys)
     assert "already holds adapted.pt: add --overwrite" in message
     assert fingerprint(folder) == before
+    for wrong in (["--held-out", "2"], ["--checkpoint", str(folder / "adapted.pt")]):
+        fails(finetune, [*argv, "--overwrite", *wrong], capsys)
+        assert fingerprint(folder) == before
     finetune.main([*argv, "--overwrite", "--episodes", "0", "--steps", "1"])
     assert not list(folder.glob("success.*"))  # they were of the old policy
 
@@ -193,6 +196,19 @@ def test_neither_a_training_run_nor_a_folder_in_use_is_written_into(run, recorde
     Path("busy/.999999999.adapted.pt").write_text("left by a killed process")
     finetune.main([*adapting(run, recorded), "--out", "busy"])
     assert not list(Path("busy").glob(".*"))
+
+
+def test_novel_tasks_are_those_of_the_suite_of_the_run(run, recorded, monkeypatch, capsys):
+    info = torch.load(run / "ema-00006.pt", weights_only=True)
+    torch.save(info | {"suite": "ml45"}, "ml45.pt")
+
+    def named(tasks, *_, **__):
+        raise ValueError(f"asked for {' '.join(tasks)}")
+
+    monkeypatch.setattr(finetune, "collect", named)
+    argv = ["--task", "novel", "--checkpoint", "ml45.pt"]
+    assert "box-close hand-insert" in fails(finetune, argv, capsys)
+    assert "asked for door-close" in fails(finetune, [*argv, "--suite", "ml10"], capsys)
 
 
 def test_a_folder_that_cannot_be_made_ends_in_one_line(run, recorded, capsys):

@@ -175,6 +175,17 @@ def test_adapting_takes_the_steps_of_torchs_sgd_and_leaves_its_input(setting, fi
     assert (flat(adapted) - before).abs().max() > 1e-3
 
 
+@pytest.mark.parametrize("vectorize", [1, 2])
+def test_parameters_may_have_one_gradient_between_them(vectorize):
+    params = {name: torch.full((3,), value) for name, value in (("a", 0.3), ("b", -0.5))}
+    tasks = [(torch.full((3,), float(i)), torch.arange(3.0) + i) for i in range(3)]
+    loss = lambda p, x: ((p["a"] + p["b"] - x) ** 2).sum()  # noqa: E731
+    one, _, _ = meta_gradient(loss, params, tasks, 0.1, first_order=True, vectorize=vectorize)
+    adapted = [-0.2 + 2 * 0.1 * 2 * (support + 0.2) for support, _ in tasks]
+    expected = torch.stack([2 * (x - query) for x, (_, query) in zip(adapted, tasks)]).mean(dim=0)
+    torch.testing.assert_close(one, {"a": expected, "b": expected})
+
+
 def test_without_tasks_there_is_no_meta_gradient():
     for vectorize in (1, 2):
         with pytest.raises(ValueError, match="at least one task"):

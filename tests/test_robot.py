@@ -394,6 +394,8 @@ def test_a_target_outside_the_box_is_clamped_if_asked(emulator, settings):
         servo.check()
         heights = [pose["input_double_register_26"] for _, pose in emulator.received]
         assert servo.clamped and 0.05 <= min(heights) < 0.051
+        with pytest.raises(RobotError, match=r"jumps by 0\.400 m"):  # though clamped it is none
+            servo.follow(steps(dz=-0.4))
     assert_stop_is_last(emulator)
 
 
@@ -436,7 +438,10 @@ def test_trouble_with_the_controller_stops_the_arm_for_good(emulator, settings, 
         line.startswith(("unlock", "power", "brake", "play")) for line in emulator.dashboard_lines
     )
     if not {"drop", "garbage"} & set(fault):
-        assert emulator.received[-1][1]["input_int_register_24"] == robot.STOP
+        last, stop = (fields for _, fields in emulator.received[-2:])
+        assert stop["input_int_register_24"] == robot.STOP
+        same = [name for name in stop if "double" in name]
+        assert [stop[name] for name in same] == [last[name] for name in same]  # no new pose
 
 
 def test_a_late_policy_holds_the_arm_then_stops_it(emulator, settings):
@@ -641,7 +646,7 @@ def test_another_address_and_a_gripper_that_opens_the_other_way_are_settings(emu
 
 def test_the_check_sum_is_modbus():
     assert robot.crc16(bytes.fromhex("010300000001")).hex() == "840a"
-    assert robot.crc16(bytes.fromhex("01060103 03e8")) == robot.crc16(bytes.fromhex("0106010303e8"))
+    assert robot.crc16(bytes.fromhex("0106010303e8")).hex() == "7888"  # pymodbus says so, too
 
 
 @pytest.mark.parametrize(
@@ -840,6 +845,8 @@ def test_frames_without_depth_are_no_traceback():
         ({"servo_gain": 5}, "100 to 2000"),
         ({"num_points": 64.0}, "give 1 of int"),
         ({"num_points": True}, "give 1 of int"),
+        ({"servo_lookahead_s": 0.2}, "max_lag_m .*the arm lags by 0.050"),
+        ({"max_speed_rad_s": 2.0}, "max_lag_rad .*the arm lags by 0.200"),
         ({"outside_box": "ignore"}, "'stop', 'clamp'"),
         ({"outside_box": ["stop"]}, "give 1 of str"),
         ({"gripper_open_at": 500}, "0, 1000"),
@@ -1013,6 +1020,10 @@ def test_recording_keeps_finished_episodes_and_drops_the_others(
     Typing(monkeypatch, (0.1, "q"))
     assert ends(record(cell, 1, "--append")) == 2
     assert "was recorded with tcp_offset [0.0, 0.0, 0.17" in capsys.readouterr().err
+    settings = json.loads(Path("robot.json").read_text()) | {"num_points": 32}
+    Path("robot.json").write_text(json.dumps(settings))
+    assert ends(record(cell, 1, "--append")) == 2
+    assert "has clouds of 64 points: set num_points so" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -1248,6 +1259,9 @@ def test_a_recorded_episode_is_replayed_from_where_it_began(emulator, settings, 
     np.testing.assert_allclose(emulator.pose, expected, atol=4e-3)
     assert_within_limits(emulator, settings)
     assert ends([*argv, "--episode", "7"]) == 2 and "no --episode 7" in capsys.readouterr().err
+    data.save_demonstrations("flat.npz", replace(recorded, action=recorded.action[:, :4]))
+    assert ends(["replay", *running[1:-4], "--data", "flat.npz"]) == 2
+    assert "has (7, 4) dimensions of state and action" in capsys.readouterr().err
 
 
 def test_actions_that_are_cut_short_are_told(emulator, settings, capsys):
@@ -1381,3 +1395,8 @@ def test_a_policy_that_does_not_fit_the_robot_is_refused_before_connecting(cell,
     Path("robot.json").write_text(json.dumps(content))
     assert ends(["run", *cell, *RUN]) == 2
     assert "points, the robot (7, 7, 64)" in capsys.readouterr().err
+    policy, info = scripts.load_checkpoint("policy.pt")
+    scripts.save_checkpoint("other.pt", policy, **info, adapted_to="pour-tea")
+    Path("robot.json").write_text(json.dumps(content | {"num_points": 128}))
+    assert ends(["run", *cell, *RUN, "--checkpoint", "other.pt"]) == 2
+    assert "was adapted to pour-tea, demos.npz is of another task" in capsys.readouterr().err

@@ -286,6 +286,25 @@ def test_a_run_stopped_while_it_is_measured_is_measured_when_resumed(
     assert same_bits(whole_state(tmp_path / "run"), whole_state(run) | {"step": 6})
 
 
+def test_a_run_is_measured_and_resumed_where_it_was_asked_for(recorded, monkeypatch, capsys):
+    measured = []
+
+    def evaluated(checkpoint, *_):
+        measured.append(checkpoint.stem)
+        if measured == ["ema-00002"]:
+            signal.raise_signal(signal.SIGINT)
+        return {task: [True] for task in BASE}
+
+    monkeypatch.setattr(evaluate, "evaluate", evaluated)
+    argv = [*FEW, *"--episodes 1 --evaluate-every 2 --checkpoint-every 3 --out run".split()]
+    argv += ["--data", str(recorded)]
+    with pytest.raises(SystemExit) as end:
+        scripts.command_line(lambda: train.main(argv))
+    assert end.value.code == 130 and "add --resume to go on" in capsys.readouterr().err
+    train.main([*argv, "--resume"])
+    assert measured == [f"ema-{step:05d}" for step in (2, 2, 4, 6)]
+
+
 def test_a_broken_pipe_does_not_end_the_work(monkeypatch):
     class Broken:
         def write(self, *text):
@@ -356,6 +375,7 @@ def test_two_processes_under_torchrun_train_as_one_does(recorded, tmp_path):
     for one, both in zip(metrics(tmp_path / "one"), metrics(tmp_path / "two")):
         assert both["loss"] == pytest.approx(one["loss"], rel=1e-4)
         assert both["gradient_norm"] == pytest.approx(one["gradient_norm"], rel=1e-3)
+        assert both["loss_before"] == pytest.approx(one["loss_before"], rel=1e-4)
 
     def all_weights(policy):
         return torch.cat([policy[n].flatten() for n in one if "normalizer" not in n])
@@ -443,13 +463,23 @@ def test_own_recordings_of_any_length_and_dimension_are_trained_on_and_adapted_t
     assert "base tasks" not in capsys.readouterr().out
 
 
-def test_held_out_episodes_only_judge(capsys):
+def test_held_out_episodes_only_judge(capsys, monkeypatch):
     Path("own").mkdir()
     for task in ("stir", "pour"):
         np.savez(f"own/{task}.npz", **own_recording(90, ends=[60, 90], task=task))
     argv = "--preset tiny --steps 2 --checkpoint-every 1 --data own --clip-weights random".split()
     argv += ["--device", "cpu"]  # two runs on CUDA differ in their last bits
-    train.main([*argv, "--out", "runs/judged", "--held-out", "1"])
+    log = scripts.log
+
+    def stopped(folder, **values):
+        log(folder, **values)
+        if values["step"] == 1 and "loss" in values:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(scripts, "log", stopped)
+        train.main([*argv, "--out", "runs/judged", "--held-out", "1"])
+    train.main([*argv, "--out", "runs/judged", "--held-out", "1", "--resume"])
     printed = capsys.readouterr().out
     assert "held-out action error" in printed and re.search(r"\| held_out +\| 1 +\| 0 +\|", printed)
     assert "next: python finetune.py --data NEW.npz --checkpoint runs/judged" in printed
