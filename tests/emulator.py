@@ -79,6 +79,7 @@ class Faults:
     robot_mode: int = 7
     lose_program: bool = False  # the program ends
     no_program: bool = False  # programs are taken and not started
+    mute: float = 0.0  # the script port says nothing until so many seconds after it took a program
     blocked: bool = False  # the arm stands, whatever it is told
     paused: bool = False  # the program is paused at the panel
     frozen: bool = False  # the controller's clock stands still
@@ -264,7 +265,8 @@ class Emulator:
 
     def serve_script(self, connection: socket.socket) -> None:
         """Takes a program when its last line is there, and tells its state all the time."""
-        connection.sendall(struct.pack(">iB", 100, 16) + bytes(95))
+        if not self.faults.mute:
+            connection.sendall(struct.pack(">iB", 100, 16) + bytes(95))
         text = b""
         while not text.endswith(b"\nend\n"):
             part = connection.recv(65536)
@@ -277,6 +279,7 @@ class Emulator:
             if connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
                 return  # or leaves one
         self.load(text.decode())
+        time.sleep(self.faults.mute)
         with contextlib.suppress(OSError):
             while not self.ended.is_set() and not select.select([connection], [], [], 0.1)[0]:
                 connection.sendall(struct.pack(">iB", 100, 16) + bytes(95))

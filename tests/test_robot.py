@@ -486,6 +486,15 @@ def assert_within_limits(emulator, settings):
     assert emulator.fastest[1] <= settings.max_speed_rad_s
 
 
+def test_a_program_is_fed_while_its_port_has_not_answered(emulator, settings):
+    emulator.faults.mute = 0.4  # five times as long as the watchdog waits
+    with Moving(settings) as servo:
+        servo.follow(STILL)
+        time.sleep(0.1)
+        servo.check()
+    assert emulator.ends == ["finished"]
+
+
 def test_an_arm_that_was_moved_before_the_start_does_not_jump_back(emulator, settings):
     moving = Moving(settings)
     moving.rtde = connect(settings)
