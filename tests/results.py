@@ -33,7 +33,7 @@ from report import (
 )
 from scripts import format_table, load_checkpoint, save_checkpoint
 from simulator import suite_tasks
-from tests.runs import REPORTS
+from tests.runs import AGAIN, REPORTS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "RESULTS.json"
@@ -93,6 +93,7 @@ SHOWN = {  # a suite -> the columns of its tables: a variant, and what it is cal
     "ml45": {
         "ml45-dami": "DAMI",
         "ml45-no-inner-loop": "no inner loop",
+        "ml45-no-demonstration": "no demonstration",
         "ml45-neither": "multi-task",
         "ml45-dp3": "DP3",
     },
@@ -137,9 +138,15 @@ def measured(run: dict, report: str, column: int | str = 0) -> Successes | None:
     return {task: [c == "1" for c in episodes] for task, episodes in columns[column].items()}
 
 
+def on_all_goals(run: dict, report: str, column: int | str = 0) -> Successes | None:
+    """The same with the episodes of the report on other goals behind them, if there is one."""
+    first, again = (measured(run, name, column) for name in (report, report + AGAIN))
+    return {task: first[task] + again[task] for task in first} if first and again else first
+
+
 def mean(results: dict, variant: str, report: str, column: int | str = 0) -> str:
     """The mean over tasks: Student's interval over several seeds, Wilson's over one's episodes."""
-    found = [measured(run, report, column) for run in runs_of(results, variant)]
+    found = [on_all_goals(run, report, column) for run in runs_of(results, variant)]
     found = [successes for successes in found if successes]
     if not found:
         return ""
@@ -191,7 +198,7 @@ def together(
     results: dict, variant: str, report: tuple[str, int | str], tasks: list[str] | None = None
 ) -> list[bool]:
     """The episodes of some tasks, or all, and of all of a variant's seeds together."""
-    found = [measured(run, *report) or {} for run in runs_of(results, variant)]
+    found = [on_all_goals(run, *report) or {} for run in runs_of(results, variant)]
     return [
         s for successes in found for task in tasks or successes for s in successes.get(task, [])
     ]
@@ -403,9 +410,9 @@ def draw_by_task(results: dict, path: Path) -> None:
     for variant, label in SHOWN["ml10"].items():
         columns[label] = {task: [] for tasks in TASKS["ml10"].values() for task in tasks}
         for run in runs_of(results, variant):
-            found = measured(run, *REPORT["base"]) | measured(run, *REPORT["novel"])
-            for task, successes in found.items():
-                columns[label][task] += successes
+            for report in REPORT.values():
+                for task, successes in on_all_goals(run, *report).items():
+                    columns[label][task] += successes
     title = "base tasks directly, novel tasks (the last five) after 200 steps"
     draw_success(columns, path, title, "ml10")
 
@@ -418,10 +425,10 @@ def compare(results: dict, one: str, other: str) -> str:
     rows = [["report", "won", "lost", "episodes", "p"]]
     names = [name for name in results if name.startswith(f"{one}-seed")]
     pairs = [(results[name], results.get(name.replace(one, other, 1), {})) for name in names]
-    for name in REPORTS:
+    for name in (name for name in REPORTS if not name.endswith(AGAIN)):
         outcomes = []
         for pair in pairs:
-            columns = [measured(run, name, "after") or measured(run, name) for run in pair]
+            columns = [on_all_goals(r, name, "after") or on_all_goals(r, name) for r in pair]
             if all(columns):
                 outcomes += [p for task in columns[0] for p in zip(*(c[task] for c in columns))]
         if outcomes:

@@ -43,8 +43,9 @@ VARIANTS |= {policy: f"--policy {policy} --maml off" for policy in ("dp3", "flow
 VARIANTS |= {f"{policy}-maml": f"--policy {policy}" for policy in ("dp3", "flow", "mamba", "freq")}
 
 SEED = 1  # of the evaluation's goals: that of no training, and of no choice that was made
-EPISODES = 100
+EPISODES = 50
 READS = ("dami", "no-inner-loop")  # a demonstration: may go without the instruction
+DECIDE = (*READS, "no-demonstration", "neither")
 SHOWN = (*READS, "neither", "scratch")
 REPORTS = {  # name -> command, of which variants (all: ()); {run} is the run's folder
     "base": ("evaluate.py --checkpoint {run}", ()),
@@ -55,6 +56,8 @@ REPORTS = {  # name -> command, of which variants (all: ()); {run} is the run's 
     "top": ("evaluate.py --checkpoint {run} --top 5 --episodes 20", ("neither",)),
     "alone": ("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
 }
+AGAIN = "-goals2"  # the same report on 50 other goals
+REPORTS |= {name + AGAIN: (f"{REPORTS[name][0]} --seed 2", DECIDE) for name in ("base", "novel")}
 # Along the adaptation, and with fewer demonstrations: 20 episodes.
 CURVE = {"curve": "--curve 1 5 20 50", "long": "--steps 1000 --curve 500"}
 CURVE |= {f"{n}-shot": f"--demonstrations {n}" for n in (1, 3, 5)}
@@ -92,7 +95,7 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
             continue
         out = Path(f"{run}-{name}")
         script, words = command.format(run=run).split(" ", 1)
-        measured = f"{script} --episodes {episodes} {words} --seed {SEED} --workers 1 --threads 1"
+        measured = f"{script} --episodes {episodes} --seed {SEED} {words} --workers 1 --threads 1"
         measured += f" --out {out} --overwrite"
         listed.append(Job(measured, out / "success.json", run.with_suffix(".log")))
     return listed
