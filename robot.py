@@ -704,7 +704,7 @@ class Servo:
     def __init__(self, rtde: RTDE, settings: Settings, moves: bool = True, free: bool = False):
         self.rtde, self.settings, self.moves, self.free = rtde, settings, moves, free
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
-        self.sent = self.pose  # that, held back
+        self.sent = self.pose  # sent last: not farther ahead of the arm than `lead`
         most, ahead = (settings.max_speed_m_s, settings.max_speed_rad_s), settings.servo_lookahead_s
         self.lead = np.array(most) * ahead  # (2,) metres, radians
         self.speed = self.lead / (ahead + self.DELAY)  # (2,) a second, of the targets

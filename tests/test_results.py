@@ -81,7 +81,11 @@ def test_every_result_says_how_it_was_measured():
         training = run["training"]
         assert {"command", "hardware", "arguments", "config", "minutes"} <= set(training)
         assert np.isfinite(training["minutes"])
+        shipped = name.startswith("ml10-no-inner-loop-cpu-seed")  # of a file with another config
+        eight = "-eight-" in name or name.startswith(("before", "ml10-inner-3e-2"))
         for report in (report for name, report in run.items() if name != "training"):
+            looked = report["facts"].get("n_action_steps", training["config"]["n_action_steps"])
+            assert shipped or (looked == 8) == eight, name  # what stands side by side looks alike
             assert {"command", "hardware", "seed", "date", "text weights"} <= set(report["facts"])
             for tasks in report["successes"].values():
                 assert set(tasks) <= {*suite["base"], *suite["novel"]}
