@@ -8,9 +8,10 @@
 colours are left out), data/state, data/action and meta/episode_ends. It does not name its task.
 
 **LeRobot**, formats 2.0, 2.1 and 3.0: meta/info.json, tasks.jsonl or tasks.parquet, and in
-data/*/*.parquet observation.state, action and one array: a cloud (N, 3 or more), or depth (H, W),
-uint16 millimetres or float metres. The format has no place for a camera: intrinsics are a feature
-of that name, (4,) or (3, 3), or in the file of --camera, see `CAMERA`. Videos are not read.
+data/*/*.parquet observation.state, action and one array, by its name a cloud (N, 3 or more) or
+depth (H, W), uint16 millimetres or float metres. The format has no place for a camera: intrinsics
+are a feature of that name, (4,) or (3, 3), or in the file of --camera, which comes first, see
+`CAMERA`. Videos are not read.
 
 Every task becomes a file of data.py. Who needs zarr or pyarrow installs it.
 
@@ -28,7 +29,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from data import Demonstrations, farthest_point_sample, load_demonstrations, save_demonstrations
-from robot import CameraError, cloud
+from robot import CameraError, cloud, unfit
 from scripts import at_least, draw_demonstration, progress_bar
 
 # What the JSON of --camera may hold. Without a pose points stay in the frame of the camera: right,
@@ -212,13 +213,11 @@ def read_camera(path: Path) -> dict[str, Any]:
     """What the file of --camera says; ValueError for what `CAMERA` does not have."""
     given = read_json(path)
     for name, value in given.items():
-        shape = (4,) if name == "intrinsics" else np.shape(CAMERA.get(name, ""))
-        try:
-            numbers = np.array(value, np.float64)
-        except (TypeError, ValueError):
-            numbers = np.zeros(0)
-        if name not in CAMERA or numbers.shape != shape or not np.isfinite(numbers).all():
-            refuse(path, f"{name} is none of {', '.join(CAMERA)}, or not numbers of its shape")
+        if name not in CAMERA:
+            refuse(path, f"{name} is none of {', '.join(CAMERA)}")
+        shape = (4,) if name == "intrinsics" else np.shape(CAMERA[name])
+        if problem := unfit(value, "float", shape=shape, least=-1e5, most=1e5):
+            refuse(path, f"{name}: {problem}")
     return given
 
 

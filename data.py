@@ -250,7 +250,7 @@ class WindowSampler:
         self.positions = meta.get("positions_in_state", 0) if augment else 0
         box = meta.get("workspace") or [points.min((0, 1)).tolist(), points.max((0, 1)).tolist()]
         self.middle = torch.tensor(box).float().mean(dim=0, keepdim=True)  # (1, 3) turned about
-        self.limit = max(1.0, float(self.action[:, :3].abs().max()))  # of a displacement
+        self.limit = max(1.0, float(self.action[:, :3].abs().max()))  # of a displacement, its unit
 
         successes = meta.get("success_frames", []) if after_success is not None else []
         windows, counts = [], []

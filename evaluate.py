@@ -574,9 +574,9 @@ def main(argv: list[str] | None = None) -> None:
         paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
         n, how = args.demonstrations, (args.clip_weights, info["text_weights"], device)
         recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
-        text, identity = scripts.instruction_features(recorded, *how)
-        if "instruction" in args.without or not info.get("adaptation", {}).get("instruction", True):
-            text = {task: torch.zeros_like(feature) for task, feature in text.items()}
+        told = info.get("adaptation", {}).get("instruction", True)  # unless adapted without it
+        told = told and "instruction" not in args.without
+        text, identity = scripts.instruction_features(recorded, *how, told=told)
         for file in old:
             file.unlink()
 

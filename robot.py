@@ -1178,9 +1178,10 @@ def finish(frames: list[Frame], grip: list[float], settings: Settings) -> tuple[
     poses = [frame.state[:6].astype(float) for frame in frames]
     moves = [difference(*pair) for pair in itertools.pairwise(poses)] + [np.zeros(6)]
     problem, times = refusal(poses, settings), [frame.time for frame in frames]
-    gap, mean = max(np.diff(times), default=0), np.mean(np.diff(times)) if times[1:] else 0
-    if gap > 2 / settings.policy_hz or mean > 1.2 / settings.policy_hz:  # replay would be faster
-        problem = f"frames are {mean:.2f}, up to {gap:.2f} s apart, camera or gripper were late"
+    gaps = np.diff(times) if times[1:] else np.zeros(1)
+    if gaps.max() > 2 / settings.policy_hz or gaps.mean() > 1.2 / settings.policy_hz:
+        apart = f"{gaps.mean():.2f}, up to {gaps.max():.2f} s apart"  # replay would be faster
+        problem = f"frames are {apart}, camera or gripper were late"
     return np.column_stack([moves, grip]), problem and f"dropped: {problem}"
 
 

@@ -226,14 +226,20 @@ def test_a_wrong_dataset_is_refused_in_one_line(damage, options, message, capsys
 
 
 @pytest.mark.parametrize(
-    "camera",
-    [{"camera_to_bse": POSE}, {"intrinsics": 600}, {"intrinsics": LENS, "camera_to_base": MATRIX}],
+    "camera, message",
+    [
+        ({"camera_to_bse": POSE}, "camera_to_bse is none of intrinsics, camera_to_base"),
+        ({"intrinsics": 600}, "intrinsics: give 4 of float or int"),
+        ({"intrinsics": ["600"] * 4}, "intrinsics: give 4 of float or int"),
+        ({"crop_low_m": [0, 0, float("nan")]}, "crop_low_m: use"),
+        ({"intrinsics": LENS, "camera_to_base": MATRIX}, "camera_to_base: give 4 x 4 of float"),
+    ],
 )
-def test_a_wrong_camera_is_refused_in_one_line(camera, capsys):
+def test_a_wrong_camera_is_refused_in_one_line(camera, message, capsys):
     dataset("kitchen", seen="observation.depth", shape=(12, 16))
     Path("camera.json").write_text(json.dumps(camera))
-    message = fails(convert, "--import kitchen --camera camera.json".split(), capsys)
-    assert f"camera.json: {list(camera)[-1]} is none of intrinsics, camera_to_base" in message
+    argv = "--import kitchen --camera camera.json".split()
+    assert f"camera.json: {message}" in fails(convert, argv, capsys)
 
 
 def test_of_two_lenses_none_is_guessed_and_the_file_of_the_camera_comes_first(capsys):

@@ -340,6 +340,11 @@ def test_your_own_simulator_is_rolled_out_in(monkeypatch):
     monkeypatch.setattr(policy, "sample_actions", lambda *a: -toward(*a))
     assert rollout() == [False, False] and all(env.steps == 40 for env in envs)
 
+    policy = model.DAMIPolicy(replace(policy.config, n_action_steps=1))  # one of two frames is old
+    seen.clear()
+    rollout()
+    assert seen == list(range(envs[0].steps))
+
 
 # ---- Bad input -----------------------------------------------------------------------------------
 

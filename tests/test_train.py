@@ -305,6 +305,16 @@ def test_a_run_is_measured_and_resumed_where_it_was_asked_for(recorded, monkeypa
     assert measured == [f"ema-{step:05d}" for step in (2, 2, 4, 6)]
 
 
+def test_what_another_user_is_writing_is_left_alone(tmp_path, monkeypatch):
+    def refused(*_):
+        raise PermissionError
+
+    (tmp_path / ".1.last.pt").touch()
+    monkeypatch.setattr(os, "kill", refused)
+    with scripts.locked(tmp_path):
+        assert (tmp_path / ".1.last.pt").exists()
+
+
 def test_a_broken_pipe_does_not_end_the_work(monkeypatch):
     class Broken:
         def write(self, *text):
@@ -621,8 +631,11 @@ def test_a_run_is_not_resumed_on_other_recordings(recorded, tmp_path, capsys):
         demonstrations = data.load_demonstrations(recorded / f"{task}.npz")
         data.save_demonstrations(f"own/{task}-mine.npz", demonstrations)
     argv = ["--data", "own", *[word for word in FEW if word not in ("--suite", "ml10")]]
+    argv += ["--augment"]
     train.main([*argv, "--steps", "2", "--out", "run"])
-    for change in ({"action": -demonstrations.action}, {"instruction": "Something else."}):
+    elsewhere = demonstrations.meta | {"workspace": [[0, 0, 0], [1, 1, 1]]}
+    wrong = {"action": -demonstrations.action}, {"instruction": "Another."}, {"meta": elsewhere}
+    for change in wrong:
         data.save_demonstrations(f"own/{task}-mine.npz", replace(demonstrations, **change))
         message = fails(train, [*argv, "--steps", "2", "--out", "run", "--resume"], capsys)
         assert "was started on other recordings" in message
