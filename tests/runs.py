@@ -11,6 +11,7 @@ demonstration does. A job whose result exists is skipped, a training that was in
 """
 
 import argparse
+import re
 import subprocess
 import sys
 import threading
@@ -19,13 +20,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scripts import choose, command_line
+from tests.oracle import WORLDS
 
 VARIANTS = {
     "dami": "",
     "no-inner-loop": "--maml off",
     "no-demonstration": "--demo-encoder none",
     "neither": "--demo-encoder none --maml off",
-    "30-demonstrations": "--demo-encoder none --maml off --demonstrations 30 --data data30",
+    "twice-as-long": "--demo-encoder none --maml off --steps 20000",
     "first-order": "--maml first",
     "first-order-3e-2": "--maml first --inner-lr 3e-2",
     "inner-3e-2": "--inner-lr 3e-2",
@@ -41,13 +43,23 @@ VARIANTS = {
 }
 VARIANTS |= {policy: f"--policy {policy} --maml off" for policy in ("dp3", "flow", "mamba", "freq")}
 VARIANTS |= {f"{policy}-maml": f"--policy {policy}" for policy in ("dp3", "flow", "mamba", "freq")}
+LIMITS = {  # what more demonstrations, points, or eyes would buy; measured on base tasks alone
+    "30-demonstrations": "--demonstrations 30 --data data30",
+    "100-demonstrations": "--demonstrations 100 --data data100",
+    "points-64": "--num-points 64",
+    "points-256": "--num-points 256",
+    "positions": "--data data-positions",
+    "pixels": "--data data-pixels",
+}
+VARIANTS |= {name: f"{VARIANTS['neither']} {flags}" for name, flags in LIMITS.items()}
 
 SEED = 1  # of the evaluation's goals: that of no training, and of no choice that was made
 EPISODES = 50
 READS = ("dami", "no-inner-loop")  # a demonstration: may go without the instruction
-DECIDE = (*READS, "no-demonstration", "neither")
+LONGER = ("neither", "twice-as-long")
+DECIDE = (*READS, "no-demonstration", *LONGER)
 SHOWN = (*READS, "neither", "scratch")
-REPORTS = {  # name -> command, of which variants (all: ()); {run} is the run's folder
+REPORTS = {  # name -> command, of which variants (): all but LIMITS; {run} is the run's folder
     "base": ("evaluate.py --checkpoint {run}", ()),
     "novel": ("finetune.py --task novel --checkpoint {run}", ()),
     "told": ("evaluate.py --checkpoint {run} --swap demonstration instruction", READS),
@@ -58,6 +70,7 @@ REPORTS = {  # name -> command, of which variants (all: ()); {run} is the run's 
 }
 AGAIN = "-goals2"  # the same report on 50 other goals
 REPORTS |= {name + AGAIN: (f"{REPORTS[name][0]} --seed 2", DECIDE) for name in ("base", "novel")}
+REPORTS["limits"] = (f"{REPORTS['base'][0]} --seed 10", (*LONGER, *LIMITS))
 # Along the adaptation, and with fewer demonstrations: 20 episodes.
 CURVE = {"curve": "--curve 1 5 20 50", "long": "--steps 1000 --curve 500"}
 CURVE |= {f"{n}-shot": f"--demonstrations {n}" for n in (1, 3, 5)}
@@ -84,20 +97,25 @@ class Job:
 
 def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list[Job]:
     """Training first, then what measures it."""
-    run = Path(f"runs/{suite}-{variant}-seed{seed}")
-    flags = f"--suite {suite} --preset small --seed {seed} --episodes 0 --out {run}"
-    flags += f" --threads 1 --steps {steps} --clip-weights random {VARIANTS[variant]}"
+    run, flags = Path(f"runs/{suite}-{variant}-seed{seed}"), VARIANTS[variant]
+    world, data = "", ""
+    if variant in WORLDS:
+        world, data = f"-m tests.oracle {variant} ", f" --data data-{variant}"
+
     resume = " --resume" if (run / "last.pt").exists() else ""
-    last = run / f"ema-{1 if variant == 'scratch' else steps:05d}.pt"
-    listed = [Job(f"train.py {flags}{resume}", last, run.with_suffix(".log"))]
+    steps = int(re.findall(r"--steps (\d+)", f"--steps {steps} {flags}")[-1])
+    trained = (
+        f"{world}train.py --suite {suite} --preset small --seed {seed} --episodes 0 --out {run}"
+    )
+    trained += f" --threads 1 --steps {steps} --clip-weights random {flags}{resume}"
+    listed = [Job(trained, run / f"ema-{steps:05d}.pt", run.with_suffix(".log"))]
     for name, (command, variants) in REPORTS.items():
-        if variants and variant not in variants:
-            continue
-        out = Path(f"{run}-{name}")
-        script, words = command.format(run=run).split(" ", 1)
-        measured = f"{script} --episodes {episodes} --seed {SEED} {words} --workers 1 --threads 1"
-        measured += f" --out {out} --overwrite"
-        listed.append(Job(measured, out / "success.json", run.with_suffix(".log")))
+        if variant in variants or (not variants and variant not in LIMITS):
+            out = Path(f"{run}-{name}")
+            script, words = command.format(run=run).split(" ", 1)
+            measured = f"{world}{script} --episodes {episodes} --seed {SEED} {words}{data}"
+            measured += f" --workers 1 --threads 1 --out {out} --overwrite"
+            listed.append(Job(measured, out / "success.json", run.with_suffix(".log")))
     return listed
 
 

@@ -1,0 +1,70 @@
+"""What better eyes would buy: a command of the repository, where more can be seen.
+
+    python -m tests.oracle positions simulator.py --data data-positions
+    python -m tests.oracle positions train.py --data data-positions --out runs/positions
+    python -m tests.oracle positions evaluate.py --data data-positions --checkpoint runs/positions
+    python -m tests.oracle pixels train.py --data data-pixels --out runs/pixels
+
+`positions`: the state also holds where the object and the goal truly are. `pixels`: the camera
+casts four times as many rays. Recordings, and checkpoints, are of one of these worlds.
+"""
+
+import argparse
+import shlex
+import sys
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+
+import baselines
+import scripts
+import simulator
+from scripts import command_line
+from simulator import MetaWorldPointCloudEnv
+
+OBJECT, GOAL = slice(4, 7), slice(-3, None)  # in what Meta-World tells its experts
+
+
+def positions() -> None:
+    """Puts the object's and the goal's position into the state: (15,) instead of (9,)."""
+    observe = MetaWorldPointCloudEnv.observe
+
+    def observe_more(env: MetaWorldPointCloudEnv) -> dict[str, np.ndarray]:
+        seen = observe(env)
+        told = np.concatenate([seen["agent_pos"], env.raw[OBJECT], env.raw[GOAL]])
+        return seen | {"agent_pos": told.astype(np.float32)}
+
+    MetaWorldPointCloudEnv.observe = observe_more
+    simulator.RECIPE["positions_in_state"] += 2
+    for presets in baselines.PRESETS.values():
+        for name, config in presets.items():
+            presets[name] = replace(config, state_dim=config.state_dim + 6)
+
+
+def pixels() -> None:
+    """Doubles the camera's rows and columns."""
+    simulator.CAMERA_PIXELS *= 2
+    simulator.RECIPE["camera"][2] *= 2
+
+
+WORLDS = {"positions": positions, "pixels": pixels}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Runs a command where more can be seen.")
+    parser.add_argument("world", choices=WORLDS)
+    parser.add_argument("command", choices=("simulator.py", "train.py", "evaluate.py"))
+    parser.add_argument("flags", nargs=argparse.REMAINDER, help="the command's")
+    args = parser.parse_args()
+    WORLDS[args.world]()
+    facts = scripts.report_facts
+    command = shlex.join(["python", "-m", "tests.oracle", *sys.argv[1:]])
+    scripts.report_facts = lambda *how: facts(*how) | {"command": command}
+    import_module(args.command.removesuffix(".py")).main(args.flags)
+
+
+if __name__ == "__mp_main__":  # a worker process of `main` lives in the same world
+    WORLDS[sys.argv[1]]()
+if __name__ == "__main__":
+    command_line(main)
