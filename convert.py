@@ -29,7 +29,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from data import Demonstrations, farthest_point_sample, load_demonstrations, save_demonstrations
-from robot import CameraError, cloud, unfit
+from robot import CameraError, cloud, no_pose, unfit
 from scripts import at_least, draw_demonstration, progress_bar
 
 # What the JSON of --camera may hold. Without a pose points stay in the frame of the camera: right,
@@ -218,6 +218,10 @@ def read_camera(path: Path) -> dict[str, Any]:
         shape = (4,) if name == "intrinsics" else np.shape(CAMERA[name])
         if problem := unfit(value, "float", shape=shape, least=-1e5, most=1e5):
             refuse(path, f"{name}: {problem}")
+        if problem := name == "camera_to_base" and no_pose(value):
+            refuse(path, f"{name}: {problem}")
+        if name == "intrinsics" and min(value[:2]) <= 0:
+            refuse(path, "intrinsics: two focal lengths in pixels, then the principal point")
     return given
 
 
@@ -277,7 +281,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--task", help="its name, and the file's (default: made of the instruction)")
     add("--num-points", type=int, default=512, help="points that are kept of a cloud (512)")
     positions = "points of space, x y z, that a state begins with, if actions begin with a change"
-    add("--positions-in-state", type=int, default=0, help=f"{positions} of the first (0)")
+    positions += " of the first, and neither holds a rotation (0)"
+    add("--positions-in-state", type=int, default=0, help=positions)
     add("--feature", help="LeRobot's array of clouds or depth, if there are several")
     add("--camera", metavar="JSON", help="of depth: intrinsics, and its pose if known")
     return parser.parse_args(argv)

@@ -223,7 +223,7 @@ class WindowSampler:
         after_success: how many frames after its episode's first success a window may begin, where
             the recording tells that frame; None: any number.
         augment: `batch` moves each scene by an affine map of its own, where the recording tells the
-            positions in a state.
+            positions in a state. No other direction or rotation in it is turned.
 
     Raises ValueError for demonstrations that do not fit the policy: dimensions, points or length.
     """

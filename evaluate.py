@@ -214,9 +214,9 @@ def action_error(
 ) -> tuple[float, float]:
     """How far drawn actions are from an expert's: mean absolute error, in the action's unit.
 
-    Episodes are gone through as in a rollout, from one executed chunk of Ta actions to the next,
-    but the policy sees the expert's frames: so errors do not add up. The mean is over episodes'
-    chunks, their Ta steps and the A numbers of an action.
+    Whole episodes are gone through as in a rollout, from one executed chunk of Ta actions to the
+    next, but the policy sees the expert's frames: so errors do not add up. The mean is over the
+    frames of all episodes and the A numbers of an action.
 
     Args:
         policy: in any mode.
@@ -229,17 +229,20 @@ def action_error(
         The error, and that of always doing the mean action of `shown`, to compare it with.
     """
     generator, errors, plain = torch.Generator().manual_seed(seed), [], []
-    newest, Ta = policy.config.n_obs_steps - 1, policy.config.n_action_steps
-    for episode in range(len(unseen.episodes)):
+    To, Ta = policy.config.n_obs_steps, policy.config.n_action_steps
+    for episode in unseen.episodes:
         demo = shown.demonstration(shown.draw_episode(generator))
         context = policy.encode_demo(text[None], **{k: x.to(text.device) for k, x in demo.items()})
-        windows = unseen.gather((unseen.episode_of == episode).nonzero()[::Ta, 0])
-        windows = {name: x.to(text.device) for name, x in windows.items()}
-        done = windows["action"][:, newest : newest + Ta]  # (n, Ta, A)
-        seen = windows["points"], windows["state"]
-        drawn = policy.sample_actions(*seen, context, generator)  # (n, Ta, A)
-        errors.append((drawn - done).abs().flatten())
-        plain.append((shown.action.mean(dim=0).to(text.device) - done).abs().flatten())
+        newest = torch.arange(episode.start, episode.stop, Ta)[:, None]  # (n, 1) frames
+        seen = (newest + torch.arange(1 - To, 1)).clamp(episode.start)  # (n, To)
+        done = newest + torch.arange(Ta)  # (n, Ta), the last of them perhaps beyond the episode
+        points, state = unseen.points[seen].float(), unseen.state[seen]
+        drawn = policy.sample_actions(
+            points.to(text.device), state.to(text.device), context, generator
+        )  # (n, Ta, A)
+        acted = unseen.action[done[done < episode.stop]]  # (frames, A)
+        errors.append((drawn.to(acted.device)[done < episode.stop] - acted).abs().flatten())
+        plain.append((shown.action.mean(dim=0).to(acted.device) - acted).abs().flatten())
     return torch.cat(errors).mean().item(), torch.cat(plain).mean().item()
 
 
@@ -568,14 +571,15 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError(f"{checkpoint} was made with text weights {each['text_weights']!r}")
         if each.get("adapted_to", tasks[0]) != tasks[0] or ("adapted_to" in each and tasks[1:]):
             raise ValueError(f"{checkpoint} was adapted to {each['adapted_to']}: measure it alone")
+        if is_told(each) != is_told(info):
+            raise ValueError(f"{checkpoint}: with --no-instruction or without, not both at once")
     out = Path(args.out)
     with nullcontext() if args.gif else scripts.locked(out):
         old = [] if args.gif else scripts.claim_folder(out, args.overwrite)
         paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
         n, how = args.demonstrations, (args.clip_weights, info["text_weights"], device)
         recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
-        told = info.get("adaptation", {}).get("instruction", True)  # unless adapted without it
-        told = told and "instruction" not in args.without
+        told = is_told(info) and "instruction" not in args.without
         text, identity = scripts.instruction_features(recorded, *how, told=told)
         for file in old:
             file.unlink()
@@ -595,6 +599,11 @@ def main(argv: list[str] | None = None) -> None:
         if args.without:
             facts["without"] = " and ".join(args.without)
         measure(args, suite, runs, labels, paths, text, device, facts)
+
+
+def is_told(info: dict[str, Any]) -> bool:
+    """Whether the policy of a checkpoint is told its instruction: unless it was adapted without."""
+    return info.get("adaptation", {}).get("instruction", True)
 
 
 def measure(

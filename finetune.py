@@ -237,7 +237,7 @@ def main(argv: list[str] | None = None) -> None:
             paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
         n, how = settings.demonstrations, (args.clip_weights, info["text_weights"], device)
         recorded = {task: load_demonstrations(paths[task]).take(n) for task in tasks}
-        evaluate.hold_out(recorded, settings.held_out)  # refuses too many now
+        shown, _ = evaluate.hold_out(recorded, settings.held_out)  # refuses too many now
         text, identity = scripts.instruction_features(recorded, *how, told=settings.instruction)
         for file in old:
             file.unlink()
@@ -256,7 +256,7 @@ def main(argv: list[str] | None = None) -> None:
             if simulated and settings.episodes:
                 protocol = (settings.episodes, settings.seed, args.workers, device)
                 for column, policy in columns.items():
-                    of_task = {task: paths[task]}, text, *protocol, settings.demonstrations
+                    of_task = {task: paths[task]}, text, *protocol, len(shown[task])
                     results[column] |= evaluate.evaluate(out / policy, *of_task, **changed)
         if not results["after"]:
             return  # own recordings have no simulator to be rolled out in

@@ -79,8 +79,8 @@ class PolicyConfig:
         object.__setattr__(self, "unet_widths", tuple(self.unet_widths))
 
         layers = self.vmt_layers + self.u2t_layers
-        if () in (self.pointnet_widths, self.unet_widths) or layers > 99:
-            raise ValueError("each network needs a width, and VMT and U2T at most 99 layers")
+        if () in (self.pointnet_widths, self.unet_widths) or layers > 99 or self.timestep_dim < 4:
+            raise ValueError("give each network a width, timestep_dim >= 4, VMT and U2T 99 layers")
         for name, value in vars(self).items():
             if isinstance(value, int) and not 1 <= value <= 100_000:
                 raise ValueError(f"{name} is {value}: use at least 1, at most 100000")
@@ -96,6 +96,7 @@ class PolicyConfig:
             (self.horizon, shrink, "horizon by 2 for each level of the U-Net but the last"),
             (self.diffusion_steps, self.inference_steps, "diffusion_steps by inference_steps"),
             (self.kernel_size + 1, 2, "kernel_size + 1 by 2 (use an odd one)"),
+            (self.timestep_dim, 2, "timestep_dim by 2"),
             (self.demo_dim, self.vmt_heads, "demo_dim by vmt_heads"),
             (self.condition_dim, self.u2t_heads, "condition width by u2t_heads"),
             (math.gcd(*self.unet_widths), self.n_groups, "U-Net widths by n_groups"),

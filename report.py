@@ -127,7 +127,7 @@ def draw_success(
 
 
 def draw_curves(folder: Path) -> None:
-    """Draws curves.png of a run: the query loss, its running mean, and success where measured."""
+    """Draws curves.png of a run: the loss, its running mean, and success where measured."""
     from matplotlib.figure import Figure
 
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
@@ -139,7 +139,7 @@ def draw_curves(folder: Path) -> None:
 
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots()
-    axes.plot(steps, losses, color="C0", alpha=0.3, linewidth=0.8, label="query loss")
+    axes.plot(steps, losses, color="C0", alpha=0.3, linewidth=0.8, label="training loss")
     width = max(1, len(losses) // 50)
     mean = np.convolve(losses, np.ones(width) / width, mode="valid")
     axes.plot(steps[width - 1 :], mean, color="C0", label=f"mean of {width} steps")

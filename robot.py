@@ -112,10 +112,8 @@ class Settings:
         for name in ("tcp", "crop"):
             if not np.less(getattr(self, f"{name}_low_m"), getattr(self, f"{name}_high_m")).all():
                 self.refuse(f"{name}_low_m", f"each number must be below that of {name}_high_m")
-        pose = np.array(self.camera_to_base, dtype=float)
-        moved = np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3)
-        if not moved or np.linalg.det(pose) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
-            self.refuse("camera_to_base", "its 3 x 3 must be a rotation, its last row 0 0 0 1")
+        if problem := no_pose(self.camera_to_base):
+            self.refuse("camera_to_base", problem)
         for unit in ("m", "rad"):  # at full speed a healthy arm lags by this much
             lag = getattr(self, f"max_speed_{unit}_s") * self.servo_lookahead_s
             if lag > 0.9 * getattr(self, f"max_lag_{unit}"):
@@ -140,6 +138,15 @@ def unfit(value: Any, kind: str, help="", choices=(), shape=(), least=0.0, most=
         return f"use one of {choices}" if choices and value not in choices else None
     fits = all(least <= x <= most for x in numbers.flat)
     return None if fits else f"use {least} to {most}; lengths are in metres, angles in radians"
+
+
+def no_pose(matrix: list) -> str | None:
+    """Why a matrix (4, 4) moves no rigid body; None if it does."""
+    pose = np.array(matrix, dtype=float)
+    rigid = np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3)
+    if not rigid or np.linalg.det(pose) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
+        return "its 3 x 3 must be a rotation, its last row 0 0 0 1"
+    return None
 
 
 def load_settings(path: str | Path) -> Settings:
@@ -454,7 +461,7 @@ class Gripper:
     RETRIES = 3  # of a time-out, a bad check sum, an exception; then RobotError
 
     def __init__(self, settings: Settings, host: str, timeout: float = 0.3) -> None:
-        self.settings, self.commanded = settings, None
+        self.settings, self.timeout, self.commanded = settings, timeout, None
         self.where = settings.gripper_serial or f"{host}:{settings.gripper_port}"
         try:
             if settings.gripper_serial:
@@ -485,6 +492,7 @@ class Gripper:
                 continue
             if len(answer) < 5:
                 problem = "no answer"
+                time.sleep(self.timeout)  # a late one must not be taken for the next
             elif crc16(answer[:-2]) != answer[-2:]:
                 problem = "bad check sum"
             elif answer[1] == function | 0x80:
@@ -582,13 +590,15 @@ class RealSense:
 
     def read(self) -> np.ndarray:
         """The newest depth image (H, W) float32 in metres. CameraError: none within a second."""
+        deadline = time.monotonic() + 1.0
         try:
-            frame = self.pipeline.wait_for_frames(1000).get_depth_frame()
+            while time.monotonic() < deadline:
+                there, found = self.pipeline.try_wait_for_frames(30)  # in it Ctrl-C is not heard
+                if there and (frame := found.get_depth_frame()):
+                    return np.asarray(frame.get_data()).astype(np.float32) * self.unit
         except RuntimeError as error:
             raise CameraError(f"the RealSense camera: {error}") from None
-        if not frame:
-            raise CameraError("the RealSense camera: frames without depth")
-        return np.asarray(frame.get_data()).astype(np.float32) * self.unit
+        raise CameraError("the RealSense camera: no depth for a second")
 
 
 def realsense_intrinsics(stream: Any) -> tuple[float, ...]:
@@ -683,8 +693,8 @@ class Servo:
     holds the last target when all are reached. With `free` it only keeps the arm free to be moved
     by hand. It stops for good, and says why, when
 
-    - the newest state is older than `max_state_age_s`, the connection or its framing is lost, or
-      the controller's clock stands still or runs backwards;
+    - the newest state is older than `max_state_age_s`, or that much later than the promptest, the
+      connection or its framing is lost, or the controller's clock stands still or runs backwards;
     - the robot is not running, its safety mode is neither normal nor reduced, its speed slider is
       not at 100 %, or our program is paused, has ended, or has been replaced by another;
     - the arm is farther than `max_lag_m` or `max_lag_rad` from where it should be;
@@ -709,10 +719,11 @@ class Servo:
         self.lead = np.array(most) * ahead  # (2,) metres, radians
         self.speed = self.lead / (ahead + self.DELAY)  # (2,) a second, of the targets
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
+        self.broken_off = False  # targets were left out
         self.missing = self.SLOW  # why the arm holds
         self.lock, self.error, self.ended = threading.Lock(), None, threading.Event()
         self.changed: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
-        self.lateness, self.ages, self.clamped, self.slowed = [], [], 0, 0
+        self.lateness, self.ages, self.clamped, self.slowed, self.delay = [], [], 0, 0, math.inf
         self.thread = threading.Thread(target=self.stream, name="servo", daemon=True)
 
     def start(self, host: str) -> None:
@@ -728,6 +739,8 @@ class Servo:
                 raise RobotError(f"the arm is not moved: {reason}")
             if not self.moves or self.rtde.program_runs(state):
                 break
+            if turn == 0 and state.values["robot_status_bits"] & PROGRAM_RUNNING:
+                raise RobotError("the arm is not moved: another program runs there, stop it first")
             self.send(self.pose)
             if turn == 0:
                 text = program(self.rtde.session, settings, self.free)
@@ -762,9 +775,14 @@ class Servo:
             if reason := refusal(poses, settings):
                 self.fail(reason)
             when = now + np.arange(1, len(poses)) / settings.policy_hz
-            self.targets = list(zip(when, poses[1:]))
+            self.targets, self.broken_off = list(zip(when, poses[1:])), False
         self.slowed += self.too_fast(actions)
         self.check()
+
+    def hold(self) -> None:
+        """Leaves out the targets that are left: what comes next follows from where the arm is."""
+        with self.lock:
+            self.broken_off, self.targets = self.broken_off or bool(self.targets), []
 
     def too_fast(self, actions: np.ndarray) -> int:
         """How many actions (n, 7) ask for more than the speed allowed: they are cut short."""
@@ -820,6 +838,8 @@ class Servo:
         settings, v = self.settings, state.values
         if reason := state.trouble():
             return reason
+        delay = now - v["timestamp"]  # and a constant; clocks may drift apart by a thousandth
+        self.delay = min(self.delay + 1e-3 / settings.servo_hz, delay)
         watched = {"the controller's clock": v["timestamp"]}
         if self.moves:
             if not self.rtde.program_runs(state):
@@ -830,6 +850,9 @@ class Servo:
             if value < old or now - since > 2 * settings.max_state_age_s:
                 return f"{name} {'runs backwards' if value < old else 'stands still'}"
             self.changed[name] = (value, now if value > old else since)
+        ticks = self.changed["the controller's clock"][1] == now
+        if ticks and delay - self.delay > settings.max_state_age_s:
+            return f"states arrive {delay - self.delay:.3f} s later than at first"
         if self.free:
             return None
         metres, radians = lengths(difference(state.pose, self.pose))
@@ -897,7 +920,10 @@ class Cell:
     camera: RealSense | RecordedCamera
 
     def observe(self, servo: Servo | None = None) -> Frame:
-        """The present observation; while there is none `servo` holds the arm, until it stops it."""
+        """The present observation; while there is none `servo` holds the arm, until it stops it.
+
+        What was left to do is left out: the arm goes nowhere that is not seen.
+        """
         while True:
             try:
                 points, seen = cloud(self.camera.read(), self.camera.intrinsics, self.settings)
@@ -906,6 +932,7 @@ class Cell:
                 if servo is None:
                     raise
                 servo.missing = str(error)
+                servo.hold()
                 servo.check()
                 time.sleep(0.02)
         if servo is not None:
@@ -915,17 +942,27 @@ class Cell:
         state = np.append(pose, self.gripper.read()).astype(np.float32)
         return Frame(time.monotonic(), points, seen, state)
 
+    def prepare(self, moves: bool) -> None:
+        """Camera, gripper and arm must answer before anything moves, the gripper first."""
+        self.observe()
+        if reason := self.rtde.state(self.settings.max_state_age_s).trouble():
+            raise RobotError(f"the arm is not moved: {reason}")
+        if moves:
+            self.gripper.initialize()
+
     def made_with(self, recording: Demonstrations | None = None) -> dict:
         """What recordings tell of the robot. ValueError for one that was made with another."""
         v, settings = self.rtde.state(self.settings.max_state_age_s).values, self.settings
         now = {"policy_hz": float(settings.policy_hz), "payload_kg": round(float(v["payload"]), 3)}
         now["tcp_offset"] = v["tcp_offset"].round(4).tolist()
         now["rotation_near_rad"] = list(map(float, settings.rotation_near_rad))
+        now["gripper_open_at"] = settings.gripper_open_at
+        now["workspace"] = boxes(settings)["workspace"]
         for name, value in now.items():
-            if recording and (found := recording.meta.get(name, value)) != value:
+            if recording and (found := recording.meta.get(name)) != value:
                 made = f"{recording.task} was recorded with {name} {found}"
                 raise ValueError(f"{made}, now it is {value}: set it as it was, or record again")
-        return now
+        return now | boxes(settings)
 
 
 def boxes(settings: Settings) -> dict:
@@ -937,6 +974,8 @@ def boxes(settings: Settings) -> dict:
 @contextmanager
 def connect(args: argparse.Namespace, settings: Settings, write: bool) -> Iterator[Cell]:
     """Camera, gripper and arm; whatever was opened is closed again."""
+    if args.camera and write and args.host not in ("localhost", "127.0.0.1"):
+        raise ValueError("--camera shows an arm what was long ago: leave it out, or add --dry-run")
     with ExitStack() as stack:
         camera = RecordedCamera(args.camera) if args.camera else RealSense()
         stack.callback(camera.close)
@@ -1031,7 +1070,8 @@ def replay(args: argparse.Namespace, settings: Settings) -> None:
 def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callable, start: Any):
     """Executes the chunks (Ta, 7) with which `act` answers all frames seen, until it says None.
 
-    Frames and actions are written to a file in the format of recordings, however it ends.
+    If camera or gripper are late, or fail, what is left of a chunk is left out. Frames and actions
+    are written to a file in the format of recordings, however it ends, but by a second Ctrl-C.
     """
     name = f"{recording.task}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.npz"
     out = Path(args.out or f"runs/robot/{name}")
@@ -1039,12 +1079,10 @@ def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callabl
         raise ValueError(f"{out} exists: move it, or give another --out")
     ended, frames, actions, commanded = "done", [], [], []
     with connect(args, settings, write=not args.dry_run) as cell:
-        meta = cell.made_with(recording) | boxes(settings) | {"made_by": f"robot.{args.command}"}
+        meta = cell.made_with(recording) | {"made_by": f"robot.{args.command}"}
         servo = Servo(cell.rtde, settings, moves=not args.dry_run)
         try:
-            cell.observe()  # camera, gripper and arm answer, before anything moves
-            if servo.moves:
-                cell.gripper.initialize()
+            cell.prepare(servo.moves)
             servo.start(args.host)
             if start is not None:
                 servo.go(np.array(start))
@@ -1056,6 +1094,7 @@ def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callabl
                 for step, action in enumerate(chunk, start=1):
                     actions.append(action)
                     commanded.append(servo.pose.tolist())
+                    servo.check()
                     if servo.moves:
                         cell.gripper.move(action[6])
                     while (left := began + step / settings.policy_hz - time.monotonic()) > 0:
@@ -1063,12 +1102,18 @@ def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callabl
                         time.sleep(min(left, 0.02))
                     servo.check()
                     frames.append(cell.observe(servo))
+                    behind = time.monotonic() - began - step / settings.policy_hz
+                    if step < len(chunk) and behind > 1 / settings.policy_hz:
+                        servo.hold()  # the gripper must act where the arm was to be then
+                    if servo.broken_off and args.command == "replay":
+                        raise RobotError("camera or gripper were late: what follows would be moved")
+                    if servo.broken_off:
+                        break
         except BaseException as error:  # Ctrl-C, too
             ended = str(error) or type(error).__name__
             raise
         finally:
             servo.stop()
-            print(servo.report())
             meta |= {"commanded": commanded, "ended": ended}
             about = (recording.task, recording.instruction, meta)
             if count := min(len(frames), len(actions)):
@@ -1077,6 +1122,7 @@ def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callabl
                     print(f"wrote {out}")
                 except (OSError, ValueError) as error:
                     warn(str(error))
+            print(servo.report())
 
 
 # ---- Recording -----------------------------------------------------------------------------------
@@ -1125,10 +1171,8 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
         raise ValueError(f"{out} has clouds of {n} points: set num_points so, or use another --out")
     moves, count, due, frames, grip = not args.dry_run, 0, time.monotonic(), None, []
     with scripts.locked(out.parent), connect(args, settings, write=moves) as cell, Keys() as keys:
-        meta = cell.made_with(kept) | boxes(settings) | {"made_by": "robot.record"}
-        cell.observe()  # camera, gripper and arm answer, before anything is set free
-        if moves:
-            cell.gripper.initialize()
+        meta = cell.made_with(kept) | {"made_by": "robot.record", "camera": args.camera}
+        cell.prepare(moves)
         closed = float(cell.gripper.read() > 0.5)
         servo = Servo(cell.rtde, settings, moves, free=True)
         try:
@@ -1138,6 +1182,7 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
             while count < args.episodes and (key := keys.pressed()) != "q":
                 if key == "g":
                     closed = 1.0 - closed
+                    servo.check()
                     if moves:
                         cell.gripper.move(closed)
                 elif key == "s" and frames is None:
@@ -1197,7 +1242,7 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
         trouble = state.trouble() or refusal([state.pose], settings)
         if answers["is in remote control"] == "false":
             trouble = trouble or "it is not in remote control: switch that at the panel"
-        depth, meta = cell.camera.read(), cell.made_with() | boxes(settings)
+        depth, meta = cell.camera.read(), cell.made_with()
         points, kept = to_base(depth, cell.camera.intrinsics, settings)
         low, high = kept.min(0).round(3), kept.max(0).round(3)
         ready = cell.gripper.exchange(READ, INITIALIZED, 1)

@@ -225,6 +225,7 @@ def pick_device(name: str | None, threads: int | None = None) -> torch.device:
         ) from error
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")  # TF32, as PyTorch has convolutions anyway
+        torch.cuda.set_device(device if device.index is not None else 0)  # streams and graphs, too
     return device
 
 
@@ -590,6 +591,7 @@ def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int,
     if world > 1:
         if device.type == "cuda" and device.index is None:
             device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+            torch.cuda.set_device(device)
         backend = "nccl" if device.type == "cuda" else "gloo"
         dist.init_process_group(backend, timeout=timedelta(hours=6))  # an evaluation is long
     return device, rank, world

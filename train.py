@@ -154,7 +154,7 @@ def multi_task_gradient(
 
 
 def learning_rate(step: int, settings: Settings) -> float:
-    """Linear warm-up, then half a cosine down to zero at the last step."""
+    """Linear warm-up, then half a cosine, to zero one step after the last."""
     peak, steps, warmup = settings.lr, settings.steps, settings.warmup
     if step < warmup:
         return peak * (step + 1) / warmup

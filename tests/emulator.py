@@ -93,6 +93,7 @@ class Faults:
     gripper_bad_crc: int = 0  # so many answers
     gripper_silent: int = 0
     gripper_exception: int = 0
+    gripper_late: list[float] = field(default_factory=list)  # seconds that the next answers take
 
 
 class Emulator:
@@ -293,7 +294,10 @@ class Emulator:
             self.programs.append(program)
             if self.program:
                 self.end_program("replaced")
-            if self.faults.no_program or not re.match(r"def \w+\(\):\n(  .*\n)+end\n$", program):
+            opened = len(re.findall(r"^ *(?:def|while|if) ", program, flags=re.M))
+            whole = re.match(r"def \w+\(\):\n(  .*\n)+end\n$", program)
+            whole = whole and opened == len(re.findall(r"^ *end$", program, flags=re.M))
+            if self.faults.no_program or not whole:  # it does not compile
                 return
             self.program = {"kind": "foreign", "watchdog": None}
             loop = re.search(r"while read_input_integer_register\((\d+)\) == (\d+):", program)
@@ -303,7 +307,8 @@ class Emulator:
             if not loop or not (servo or free):
                 self.free = "  freedrive_mode()\n" in program  # until somebody ends it
                 return
-            watchdog = re.search(r'rtde_set_watchdog\("(\w+)", ([\d.]+), "stop"\)', program)
+            armed = program[: loop.start()]  # before the arm is moved, or free
+            watchdog = re.search(r'rtde_set_watchdog\("(\w+)", ([\d.]+), "stop"\)', armed)
             lookahead = re.search(r"lookahead_time=([\d.]+)", program)
             first = register(r"number = read_input_integer_register\((\d+)\)", "input_int")
             second = register(r"number == read_input_integer_register\((\d+)\)", "input_int")
@@ -513,6 +518,7 @@ class Emulator:
                     continue  # as a slave does: no answer
                 self.gripper_frames.append(frame)
                 answer = self.answer(frame)
+                time.sleep(self.faults.gripper_late.pop(0) if self.faults.gripper_late else 0)
                 if self.faults.gripper_silent:
                     self.faults.gripper_silent -= 1
                     continue

@@ -46,8 +46,8 @@ def fuzz_robot(seed: int, rounds: int = 8) -> tuple[list[float], list[float], st
             emulator.pose[3:] = [0.0, np.pi, 0.0]
         rtde = robot.RTDE("127.0.0.1", settings.rtde_port, settings.servo_hz, True)
         servo = robot.Servo(rtde, settings)
+        servo.start("127.0.0.1")
         with contextlib.suppress(robot.RobotError):
-            servo.start("127.0.0.1")
             for _ in range(rounds):
                 name = FAULTS[rng.integers(len(FAULTS))]
                 if rng.random() < 0.2:
@@ -75,6 +75,7 @@ def fuzz_robot(seed: int, rounds: int = 8) -> tuple[list[float], list[float], st
         time.sleep(0.3)  # whatever was held back goes on now
         servo.stop()
         rtde.close()
+        assert max(emulator.fastest) > 0, "the arm was never moved"
         return emulator.fastest, [settings.max_speed_m_s, settings.max_speed_rad_s], reason
 
 

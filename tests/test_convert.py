@@ -233,6 +233,8 @@ def test_a_wrong_dataset_is_refused_in_one_line(damage, options, message, capsys
         ({"intrinsics": ["600"] * 4}, "intrinsics: give 4 of float or int"),
         ({"crop_low_m": [0, 0, float("nan")]}, "crop_low_m: use"),
         ({"intrinsics": LENS, "camera_to_base": MATRIX}, "camera_to_base: give 4 x 4 of float"),
+        ({"camera_to_base": [[-1, 0, 0, 0], *np.eye(4).tolist()[1:]]}, "camera_to_base: its 3 x 3"),
+        ({"intrinsics": [-50.0, *LENS[1:]]}, "intrinsics: two focal lengths in pixels"),
     ],
 )
 def test_a_wrong_camera_is_refused_in_one_line(camera, message, capsys):

@@ -381,6 +381,9 @@ def test_a_policy_that_was_adapted_is_measured_on_its_task_alone(run, recorded, 
     assert "was adapted to door-close, not to reach" in message
     message = fails(evaluate, [*argv, run, "adapted.pt"], capsys)
     assert "adapted.pt was adapted to door-close: measure it alone" in message
+    torch.save(info | {"adaptation": {"instruction": False}}, "untold.pt")
+    message = fails(evaluate, [*argv, run, "untold.pt"], capsys)
+    assert "untold.pt: with --no-instruction or without" in message
 
 
 def test_a_policy_of_own_recordings_cannot_be_rolled_out(run, recorded, capsys):
@@ -436,9 +439,9 @@ def test_the_action_error_is_the_mean_absolute_error_over_executed_chunks(monkey
     monkeypatch.setattr(policy, "sample_actions", draw)
     monkeypatch.setattr(policy, "encode_demo", lambda text, demo_action, **_: demo_action)
     error, plain = evaluate.action_error(policy, shown, unseen, torch.zeros(512))
-    # Episode 1: chunks at 0, 8, 16, 24, 32; episode 2 has 12 frames: one window, from frame 0.
-    first, second = 10 + 0.01 * np.arange(40), 20 + 0.01 * np.arange(8)
-    assert [len(chunks) for chunks in drawn] == [5, 1]
+    # Episode 1: chunks at 0, 8, 16, 24, 32; episode 2 has 12 frames: at 0, and half a one at 8.
+    first, second = 10 + 0.01 * np.arange(40), 20 + 0.01 * np.arange(12)
+    assert [len(chunks) for chunks in drawn] == [5, 2]
     actions = np.concatenate([first, second])
     assert error == pytest.approx(np.abs(actions - 10.5).mean(), rel=1e-4)
     assert plain == pytest.approx(np.abs(actions - 0.01 * 14.5).mean(), rel=1e-4)

@@ -117,9 +117,11 @@ def test_rollouts_read_the_demonstrations_that_were_adapted_to(run, recorded, mo
 
     monkeypatch.setattr(evaluate, "evaluate", evaluate_nothing)
     file = recorded / "reach.npz"
-    argv = [*adapting(run, file, "--episodes 1", task="reach"), "--demonstrations", "1"]
-    finetune.main(argv)
+    argv = [*adapting(run, file, "--episodes 1", task="reach"), "--demonstrations"]
+    finetune.main([*argv, "1"])
     assert seen == [1, 1]  # before and after
+    finetune.main([*argv, "2", "--held-out", "1", "--overwrite"])
+    assert seen[2:] == [1, 1]
 
 
 def test_own_recordings_are_adapted_to_without_a_simulator(run, capsys):

@@ -103,6 +103,8 @@ def sample(policy, batch, seed=0):
         ({"u2t_heads": 7}, ("384", "7")),
         ({"unet_widths": (512, 1020, 2048)}, ("4", "8")),
         ({"demo_encoder": "lstm"}, ("lstm", "vmt")),
+        ({"timestep_dim": 2}, ("timestep_dim >= 4",)),
+        ({"timestep_dim": 31}, ("timestep_dim", "31", "2")),
         ({"tcfm": "left"}, ("left", "mid")),
     ],
 )

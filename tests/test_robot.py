@@ -551,6 +551,11 @@ def test_a_program_that_is_not_ours_is_not_followed_by_more_targets(
         count = len(emulator.received)
         assert "our program stands still" in stops(servo)
         assert len(emulator.received) - count < settings.servo_hz
+    # It is not replaced either: whoever started it may count on it.
+    with pytest.raises(RobotError, match="another program runs there"):
+        Moving(settings).__enter__()
+    with emulator.lock:
+        emulator.end_program("finished")
     # What a killed process left in the registers is not taken for a program of ours.
     emulator.faults.no_program = True
     emulator.outputs["output_int_register_24"] = 1
@@ -599,6 +604,51 @@ def test_braking_is_not_cut_short_by_the_watchdog(emulator, settings):
     assert emulator.ends == ["finished"]
 
 
+@pytest.mark.parametrize("free", [False, True])
+def test_the_program_is_this_text(settings, free):
+    """Each line of it keeps the arm from something: change it here, and say why."""
+    servo = "servoj(get_inverse_kin(pose, get_actual_joint_positions()), t=0.0080, "
+    servo += "lookahead_time=0.100, gain=300)"
+    reads = ", ".join(f"read_input_float_register({n})" for n in (24, 25, 26, 27, 28, 29))
+    lines = f"""def dami():
+  rtde_set_watchdog("input_int_register_24", 12.5, "stop")
+  write_output_integer_register(25, 0)
+  write_output_integer_register(24, 7)
+  {"freedrive_mode" if free else "sync"}()
+  while read_input_integer_register(24) == 7:
+    number = read_input_integer_register(26)
+    pose = p[{reads}]
+    if number == read_input_integer_register(25):
+      write_output_integer_register(25, number)
+      {"sync()" if free else servo}
+    else:
+      sync()
+    end
+  end
+  rtde_set_watchdog("input_int_register_24", 0.1, "ignore")
+  {"end_freedrive_mode" if free else "sync"}()
+  stopj(2.0)
+  write_output_integer_register(24, 0)
+end
+"""
+    assert robot.program(7, settings, free) == lines
+
+
+def test_states_that_come_later_and_later_stop_the_arm(emulator, settings):
+    with Moving(replace(settings, max_hold_s=10)) as servo:
+        state, now = servo.rtde.state(), time.monotonic()
+        servo.ended.set()
+        servo.thread.join()
+        for tick in range(200):  # the network delays each package by 2 ms more than the one before
+            values = state.values.copy()
+            values["timestamp"] += 0.008 * tick
+            values["output_int_register_25"] += tick
+            late = servo.trouble(state._replace(values=values), now + 0.010 * tick)
+            if late:
+                break
+        assert "later than at first" in late and 0.25 < 0.002 * tick < 0.3
+
+
 def test_a_program_that_does_not_end_is_told(emulator, settings, capsys):
     with Moving(settings):
         emulator.faults.paused = True
@@ -640,6 +690,15 @@ def test_the_gripper_initializes_moves_and_tells_where_it_is(emulator, settings)
     time.sleep(0.8)
     assert gripper.read() == pytest.approx(1.0, abs=0.01)
     assert [frame[:6].hex() for frame in emulator.gripper_frames].count("010601030000") == 1
+    gripper.close()
+
+
+def test_a_late_answer_is_not_taken_for_the_next_one(emulator, settings):
+    gripper = Gripper(settings, "127.0.0.1", timeout=0.1)
+    gripper.initialize()
+    emulator.faults.gripper_late = [0.12, 0.05, 0.05]
+    assert gripper.exchange(robot.READ, robot.INITIALIZED, 1) == 1
+    assert gripper.read() == 0.0
     gripper.close()
 
 
@@ -820,8 +879,9 @@ def test_frames_without_depth_are_no_traceback():
     camera = object.__new__(robot.RealSense)
     empty = type("Empty", (), {"__bool__": lambda self: False})()
     frames = type("Frames", (), {"get_depth_frame": lambda self: empty})()
-    camera.pipeline = type("Pipeline", (), {"wait_for_frames": lambda self, ms: frames})()
-    with pytest.raises(robot.CameraError, match="without depth"):
+    asked = lambda self, ms: time.sleep(ms / 1000) or (True, frames)  # noqa: E731
+    camera.pipeline = type("Pipeline", (), {"try_wait_for_frames": asked})()
+    with pytest.raises(robot.CameraError, match="no depth for a second"):
         camera.read()
 
 
@@ -1175,6 +1235,8 @@ def robot_policy(path, **changes):
     points = rng.uniform(-0.5, 0.5, (30, 64, 3)).astype(np.float16)
     arrays = (points, state.astype(np.float32), action.astype(np.float32), np.array([30]))
     meta = {"policy_hz": 20.0, "tcp_offset": [0.0, 0.0, 0.17, 0.0, 0.0, 0.0], "payload_kg": 1.1}
+    meta |= {"gripper_open_at": 1000, **robot.boxes(Settings(**BOXES))}
+    meta["rotation_near_rad"] = list(Settings(**BOXES).rotation_near_rad)
     recorded = data.Demonstrations("stack-cube", "Stack the cube.", *arrays, meta)
     policy.normalizer.fit(*(torch.from_numpy(x) for x in (points.astype(np.float32), *arrays[1:3])))
     data.save_demonstrations(Path(path).with_name("demos.npz"), recorded)
@@ -1340,6 +1402,53 @@ def test_keys_that_arrive_together_are_all_read(monkeypatch):
     time.sleep(0.1)
     with robot.Keys() as keys:
         assert [keys.pressed() for _ in range(3)] == ["s", "e", ""]
+
+
+def test_a_late_camera_breaks_off_a_chunk_so_that_the_gripper_acts_in_its_place(
+    emulator, running, monkeypatch, capsys
+):
+    read, sample, chunks = robot.RecordedCamera.read, model.DAMIPolicy.sample_actions, []
+
+    def late(self):
+        time.sleep(0.12)
+        return read(self)
+
+    monkeypatch.setattr(robot.RecordedCamera, "read", late)
+    monkeypatch.setattr(
+        model.DAMIPolicy, "sample_actions", lambda *args: chunks.append(1) or sample(*args)
+    )
+    assert ends([*running, "--seconds", "1"]) == 0, capsys.readouterr().err
+    assert len(the_log().action) == len(chunks) >= 3  # of each chunk of 8 the first action
+    assert ends(["replay", *running[1:-4], "--data", "demos.npz"]) == 2
+    assert "camera or gripper were late" in capsys.readouterr().err
+
+
+def test_the_gripper_is_not_moved_once_the_arm_was_stopped(emulator, running, monkeypatch, capsys):
+    observe, count = robot.Cell.observe, []
+
+    def stopped(cell, servo=None):
+        frame = observe(cell, servo)
+        if servo is not None and len(emulator.received) > 20:
+            emulator.faults.safety_mode = 7  # while nothing else is looked at
+            time.sleep(0.05)
+            count.append(len(emulator.gripper_frames))
+        return frame
+
+    monkeypatch.setattr(robot.Cell, "observe", stopped)
+    assert ends(["replay", *running[1:-4], "--data", "demos.npz"]) == 2
+    assert "emergency stop" in capsys.readouterr().err
+    assert len(emulator.gripper_frames) == count[0]
+    assert ends(["replay", *running[1:-4], "--data", "demos.npz"]) == 2
+    assert all(frame[1] == 3 for frame in emulator.gripper_frames[count[0] :])  # reads only
+
+
+def test_an_arm_is_not_driven_by_a_recorded_camera_or_an_unknown_recording(running, capsys):
+    elsewhere = [word if word != "127.0.0.1" else "10.9.9.9" for word in running]
+    assert ends(elsewhere) == 2 and "--camera shows an arm" in capsys.readouterr().err
+    recorded = data.load_demonstrations("demos.npz")
+    data.save_demonstrations("demos.npz", replace(recorded, meta={"imported_from": "x.zarr"}))
+    assert ends(["replay", *running[1:-4], "--data", "demos.npz"]) == 2
+    assert "was recorded with policy_hz None" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
