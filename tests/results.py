@@ -83,6 +83,16 @@ ABLATION = {  # a row of the paper's ablation -> our variant, and what it is
     "+tcfm-mid": ("mid", "VMT, TCFM in the middle"),
     "+tcfm-up": ("up", "VMT, TCFM in the last up-sampling level"),
 }
+LIMITS = {  # what multi-task training may lack -> what it is given
+    "neither": "`small` as it is: 10 demonstrations, 128 points, 84 x 84 rays, 10 000 steps",
+    "twice-as-long": "20 000 steps",
+    "30-demonstrations": "30 demonstrations",
+    "100-demonstrations": "100 demonstrations",
+    "points-64": "64 points",
+    "points-256": "256 points",
+    "pixels": "168 x 168 rays",
+    "positions": "the true positions of object and goal, in the state",
+}
 SHOWN = {  # a suite -> the columns of its tables: a variant, and what it is called there
     "ml10": {
         "ml10-dami": "DAMI",
@@ -273,6 +283,19 @@ def length_table(results: dict) -> str:
     return format_table(rows)
 
 
+def limits_table(results: dict) -> str:
+    """What multi-task training succeeds in when it is given something, seed 0 of each."""
+    rows = [["given", "base tasks", "won, lost against the first"]]
+    plain = measured(results["ml10-neither-seed0"], "limits")
+    for variant, title in LIMITS.items():
+        found = measured(results.get(f"ml10-{variant}-seed0", {}), "limits")
+        if found:
+            pairs = [pair for task in plain for pair in zip(found[task], plain[task])]
+            against = f"{pairs.count((True, False))}, {pairs.count((False, True))}"
+            rows.append([title, pooled_success(found), against if variant != "neither" else ""])
+    return format_table(rows)
+
+
 def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
     """Policy -> what it is shown, and its episodes on the base tasks."""
     found = {}
@@ -331,6 +354,7 @@ TABLES = {
     "policies": policies_table,
     "ablation": ablation_table,
     "length": length_table,
+    "limits": limits_table,
     "ml45 means": lambda results: means_table(results, "ml45"),
     "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),
     "ml45 novel": by_task_table("novel", "ml45"),

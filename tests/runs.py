@@ -57,7 +57,7 @@ SEED = 1  # of the evaluation's goals: that of no training, and of no choice tha
 EPISODES = 50
 READS = ("dami", "no-inner-loop")  # a demonstration: may go without the instruction
 LONGER = ("neither", "twice-as-long")
-DECIDE = (*READS, "no-demonstration", *LONGER)
+DECIDE = (*READS, "no-demonstration", "neither")
 SHOWN = (*READS, "neither", "scratch")
 REPORTS = {  # name -> command, of which variants (): all but LIMITS; {run} is the run's folder
     "base": ("evaluate.py --checkpoint {run}", ()),
