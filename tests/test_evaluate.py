@@ -346,6 +346,41 @@ def test_your_own_simulator_is_rolled_out_in(monkeypatch):
     assert seen == list(range(envs[0].steps))
 
 
+def watched_rollout(monkeypatch, env, **how):
+    """40 steps away from the goal; the demonstrations and the frames that the policy is given."""
+    policy, demonstrations, frames = model.DAMIPolicy(model.PRESETS["tiny"]), [], []
+
+    def away(points, state, context, generator):
+        frames.append({"point_cloud": points[0].numpy(), "agent_pos": state[0].numpy()})
+        return -torch.ones(1, 8, 2)
+
+    monkeypatch.setattr(policy, "encode_demo", lambda text, **demo: demonstrations.append(demo))
+    monkeypatch.setattr(policy, "sample_actions", away)
+    sampler = data.WindowSampler(numbered([40]), policy.config)
+    given = sampler, torch.zeros(512), torch.Generator()
+    assert evaluate.rollout(policy, [env], [5], *given, **how) == [False]
+    return demonstrations, frames
+
+
+def test_a_rollout_shows_the_policy_the_older_frame_first_and_the_newest_last(monkeypatch):
+    env, observed = Table(), {}
+    observe = env.observe
+    monkeypatch.setattr(env, "observe", lambda: observed.setdefault(env.steps, observe()))
+    _, frames = watched_rollout(monkeypatch, env)
+    for newest, found in zip(range(0, 40, 8), frames, strict=True):
+        older = max(newest - 1, 0)
+        for part, x in found.items():
+            np.testing.assert_array_equal(x, [observed[step][part] for step in (older, newest)])
+
+
+def test_a_demonstration_that_is_left_out_of_a_rollout_is_all_zeros(monkeypatch):
+    (shown,), _ = watched_rollout(monkeypatch, Table())
+    (left_out,), _ = watched_rollout(monkeypatch, Table(), blank=True)
+    assert shown["demo_points"].any() and shown["demo_action"].any()
+    for part, x in shown.items():
+        assert torch.equal(left_out[part], torch.zeros_like(x))
+
+
 # ---- Bad input -----------------------------------------------------------------------------------
 
 
@@ -391,12 +426,6 @@ def test_a_policy_of_own_recordings_cannot_be_rolled_out(run, recorded, capsys):
     torch.save(info | {"suite": "own"}, "own.pt")
     message = fails(evaluate, ["--checkpoint", "own.pt", "--data", recorded], capsys)
     assert "no simulator" in message
-
-
-def test_a_command_ends_quietly_or_in_one_line(capsys):
-    with pytest.raises(SystemExit) as end:
-        scripts.command_line(lambda: (_ for _ in ()).throw(KeyboardInterrupt()))
-    assert end.value.code == 130
 
 
 # ---- Held-out episodes ---------------------------------------------------------------------------

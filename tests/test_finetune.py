@@ -1,5 +1,6 @@
 """Tests of finetune.py: one task, all novel tasks, own recordings, bad input."""
 
+import copy
 import json
 import re
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 import torch
 from conftest import fails, fingerprint, metrics, same_bits, weights
 
+import data
 import evaluate
 import finetune
 import model
@@ -88,6 +90,68 @@ def test_adaptation_is_repeatable_and_moves_only_what_has_a_learning_rate(run, r
 
     assert moved(a) == {"observation_encoder", "demo_encoder", "u2t", "unet", "normalizer"}
     assert moved(frozen) == {"unet"}
+
+
+def test_two_steps_of_adaptation_are_two_of_plain_adamw_on_gradients_clipped_to_norm_one():
+    torch.manual_seed(0)
+    policy = model.DAMIPolicy(model.PRESETS["tiny"]).double()  # weight decay is small
+    recording = own_recording(400, ends=[200, 400]) | {"meta": {}}
+    recording["action"] *= np.linspace(1, 20, 400)[:, None]  # not normalized: large gradients
+    sampler = data.WindowSampler(data.Demonstrations(**recording), policy.config)
+    text, rates = torch.randn(512).double(), {"vision": 1e-3, "diffusion": 3e-3, "other": 1e-2}
+    adapting = finetune.adapt_policy(policy, sampler, text, 2, 4, rates, seed=7)
+
+    plain, generator = copy.deepcopy(policy), torch.Generator().manual_seed(7)
+    parts = plain.parameter_groups()
+    groups = [{"params": parts[name], "lr": rate} for name, rate in rates.items()]
+    optimizer = torch.optim.AdamW(groups, betas=(0.95, 0.999), weight_decay=1e-6)
+    average, norms = model.ema_model(plain), []
+    for _, found, adapted in adapting:
+        batch = sampler.batch(4, generator) | plain.draw_noise_and_timesteps(4, generator)
+        optimizer.zero_grad()
+        loss = plain.loss(text=text[None], **batch)
+        loss.backward()
+        norms.append(torch.nn.utils.clip_grad_norm_(plain.parameters(), 1.0).item())
+        optimizer.step()
+        average.update_parameters(plain)
+        assert found == pytest.approx(loss.item())
+        moved = zip(adapted.parameters(), average.module.parameters())
+        assert all(torch.allclose(*pair, atol=1e-10, rtol=0) for pair in moved)
+    assert min(norms) > 1 and max(norms) > 1.05 * min(norms)  # AdamW does not feel a common factor
+
+
+def test_the_papers_learning_rates_belong_to_its_meta_training_and_are_scaled_to_this_one(
+    run, recorded
+):
+    finetune.main([*adapting(run, recorded, "--lr-other 0.25"), "--out", "adapted"])
+    info = weights("adapted/adapted.pt")[1]
+    assert info["arguments"]["lr"] == 3e-3  # the paper's is 1e-4
+    rates = json.loads(Path("adapted/config.json").read_text())["learning_rates"]
+    assert rates == pytest.approx({"vision": 3e-4, "diffusion": 9e-4, "other": 0.25})
+    assert info["adaptation"]["learning_rates"] == rates
+
+
+def test_without_its_instruction_a_task_is_adapted_to_and_rolled_out_on_zeros(
+    run, recorded, monkeypatch
+):
+    adapt_policy, read = finetune.adapt_policy, []
+
+    def watched(policy, sampler, text, *others):
+        read.append(text)
+        return adapt_policy(policy, sampler, text, *others)
+
+    def measured(checkpoint, paths, text, *_, **__):
+        read.append(text["door-close"])
+        return {"door-close": [True]}
+
+    monkeypatch.setattr(finetune, "adapt_policy", watched)
+    monkeypatch.setattr(evaluate, "evaluate", measured)
+    finetune.main([*adapting(run, recorded), "--out", "told"])
+    finetune.main([*adapting(run, recorded, "--no-instruction --episodes 1"), "--out", "untold"])
+    options = "--demonstrations 2 --episodes 1 --checkpoint untold --out measured".split()
+    evaluate.main(["--data", str(recorded), *options])
+    told, *untold = read  # the others: adapted with, before, after, and by evaluate.py
+    assert told.any() and len(untold) == 4 and not any(text.any() for text in untold)
 
 
 def test_all_novel_tasks_are_adapted_to_as_each_alone(run, recorded, monkeypatch):

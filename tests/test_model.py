@@ -451,6 +451,22 @@ def test_the_normalizer_maps_the_data_onto_minus_one_to_one_and_back():
     assert (drawn[:, 1] - 0.4).abs().max() < 1e-4  # what no demonstration moved stays
 
 
+def test_every_part_of_a_demonstration_is_normalized_before_it_is_encoded():
+    policy = new_policy()
+    batch = random_batch(policy.config)
+    parts = ("points", "state", "action")
+    raw = {part: 300 + 50 * batch[f"demo_{part}"] for part in parts}
+    extremes = {part: x.flatten(0, -2).aminmax(dim=0) for part, x in raw.items()}
+    by_hand = {
+        f"demo_{part}": 2 * (x - extremes[part].min) / (extremes[part].max - extremes[part].min) - 1
+        for part, x in raw.items()
+    }
+    expected = context_of(policy, batch | by_hand)  # nothing is fitted: as they are
+    policy.normalizer.fit(**raw)
+    found = context_of(policy, batch | {f"demo_{part}": x for part, x in raw.items()})
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+
+
 def test_the_moving_average_follows_the_papers_decay():
     policy = new_policy()
     ema = model.ema_model(policy)
