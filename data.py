@@ -160,8 +160,9 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path} is missing: collect it with `python simulator.py`, or record it")
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path} is truncated or no .npz file: delete it and collect it again")
+    with open(path, "rb") as file:
+        if not zipfile.is_zipfile(file):
+            raise ValueError(f"{path} is truncated or no .npz file: record or collect it again")
     try:
         with np.load(path, allow_pickle=False) as file:
             missing = [part for part in PARTS if part not in file.files]

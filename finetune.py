@@ -209,8 +209,9 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError(f"{file} is a recording of {tasks[0]}, not of {args.task[0]}")
     elif args.task != ["novel"]:
         tasks = [check_task(task) for task in args.task]
-    if args.suite:
-        suite_tasks(args.suite)  # refuses a wrong one now
+    suite_tasks(args.suite or "ml10")  # refuses a wrong one now
+    if not all(0 < step < settings.steps for step in args.curve):
+        raise ValueError(f"--curve: use steps from 1 to {settings.steps - 1}, those before --steps")
     suite = args.suite or "ml10" if simulated else "own"
     checkpoint = scripts.checkpoints_of(args.checkpoint or evaluate.default_checkpoint(suite))[-1]
     changed = scripts.inference(args)
@@ -232,10 +233,8 @@ def main(argv: list[str] | None = None) -> None:
         old = [file for path in claimed for file in scripts.claim_folder(path, args.overwrite)]
         if checkpoint.resolve() in [path.resolve() for path in old]:
             raise ValueError(f"{checkpoint} itself would be overwritten: choose another --out")
-        paths = {tasks[0]: file}
-        if file is None:
-            paths = collect(tasks, args.data, settings.demonstrations, workers=args.workers)
         n, how = settings.demonstrations, (args.clip_weights, info["text_weights"], device)
+        paths = {tasks[0]: file} if file else collect(tasks, args.data, n, workers=args.workers)
         recorded = {task: load_demonstrations(paths[task]).take(n) for task in tasks}
         shown, _ = evaluate.hold_out(recorded, settings.held_out)  # refuses too many now
         text, identity = scripts.instruction_features(recorded, *how, told=settings.instruction)
@@ -243,7 +242,7 @@ def main(argv: list[str] | None = None) -> None:
             file.unlink()
 
         # Each task before, in between if asked for, and after
-        between = sorted({step for step in args.curve if 0 < step < settings.steps})
+        between = sorted(set(args.curve))
         columns = {"before": checkpoint.resolve()}
         columns |= {f"{step} steps": f"adapted-{step:05d}.pt" for step in between}
         columns["after"] = "adapted.pt"

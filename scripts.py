@@ -15,6 +15,7 @@ import multiprocessing
 import os
 import platform
 import queue
+import re
 import shlex
 import shutil
 import signal
@@ -196,6 +197,9 @@ def command_line(main: Callable[[], None], *errors: type[Exception]) -> None:
         if sys.flags.dev_mode:
             raise
         line, code = f"error: {' '.join(str(error).split())}", 2
+        if isinstance(error, OSError) and error.filename and error.strerror:
+            path = re.sub(r"(^|/)\.\d+\.", r"\1", str(error.filename))  # of `write_atomically`
+            line = f"error: {path}: {error.strerror.lower()}, name another file or folder"
     except (MemoryError, RuntimeError) as error:
         if sys.flags.dev_mode or "memory" not in f"{type(error)} {error}".lower():
             raise
@@ -410,6 +414,8 @@ def load_checkpoint(
             odd = [entry.filename for entry in archive.infolist() if entry.external_attr]
             damaged = archive.testzip() or next(iter(odd), None)  # attributes: a folder to torch
         info = None if damaged else torch.load(path, map_location=device, weights_only=True)
+    except PermissionError:
+        raise
     except Exception as error:  # torch raises many types here; each means it cannot be read
         raise ValueError(f"{path} is damaged or no PyTorch checkpoint: use another file") from error
 
@@ -532,6 +538,8 @@ def locked(folder: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ValueError(f"another process runs in {folder}: use another --out") from None
+        if not os.access(folder, os.W_OK):
+            raise ValueError(f"{folder} cannot be written to: use another --out")
         remove_temporaries(folder)
         yield
     finally:

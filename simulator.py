@@ -132,8 +132,12 @@ def own_recordings(folder: str | Path) -> dict[str, Path]:
     """Task -> file of the recordings in a folder; none if they are Meta-World's, by their names."""
     paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
     known, problem = [task for task in paths if task in INSTRUCTIONS], None
-    if not Path(folder).is_dir():
+    if Path(folder).is_file():
+        problem = f"{folder} is a file: name its folder, all recordings in it are trained on"
+    elif not Path(folder).is_dir():
         problem = f"there is no folder {folder}: with --suite ml10, experts fill it"
+    elif not paths:
+        problem = f"{folder} holds no recordings (.npz): with --suite ml10, experts fill it"
     elif known and len(known) < len(paths):
         problem = f"{folder} mixes your recordings with {known[0]}: move one kind elsewhere"
     if problem:
@@ -220,7 +224,8 @@ class RayCastCamera:
 
     MuJoCo's own rays pass through sites, yet goals are often drawn as sphere sites (Meta-World's
     are), so those are intersected here. Visible is what MuJoCo's renderer shows by default: groups
-    0 to 2, alpha above 0.
+    0 to 2, alpha above 0. A body that never moves and is as wide as the workspace, or has a plane,
+    is scenery: what stands on a floor needs a body of its own.
 
     Args:
         model: its camera is moved, and invisible geoms are put into a group that rays pass through.
@@ -250,7 +255,8 @@ class RayCastCamera:
 
         # Where the camera is and what it looks at.
         index = model.camera(camera).id
-        if model.cam_bodyid[index] != 0:
+        follows = model.cam_mode[index] != mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+        if model.cam_bodyid[index] != 0 or follows:
             raise ValueError(f"camera {camera!r} moves with a body; a fixed one is needed")
         if position is not None:
             model.cam_pos[index] = position  # in the model: MuJoCo's renderer would see the same

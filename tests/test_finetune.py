@@ -159,7 +159,7 @@ def test_all_novel_tasks_are_adapted_to_as_each_alone(run, recorded, monkeypatch
         return {task: [True, policy.stem != "ema-00006"] for task in paths}
 
     monkeypatch.setattr(evaluate, "evaluate", measured)
-    options = "--episodes 2 --curve 1 9"
+    options = "--episodes 2 --curve 1"
     finetune.main([*adapting(run, recorded, options, task="novel"), "--out", "all"])
     finetune.main([*adapting(run, recorded), "--out", "alone"])
     adapted, info = weights("all/door-close/adapted.pt")
@@ -210,6 +210,7 @@ def test_own_recordings_are_adapted_to_without_a_simulator(run, capsys):
         ("--task shelf-place --lr-other -1", "--lr-other is -1.0: use at least 0"),
         ("--task shelf-place --checkpoint none.pt", "none.pt"),
         ("--task novel --suite ml1", "unknown suite 'ml1'"),
+        ("--task shelf-place --curve 5 500", "--curve: use steps from 1 to 199"),
     ],
 )
 def test_a_wrong_argument_ends_in_one_line_that_says_what_to_do(options, message, capsys):

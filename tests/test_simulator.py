@@ -89,8 +89,9 @@ def test_demonstrations_and_evaluation_never_share_a_seed():
 SCENE = """
 <mujoco><asset><material name="opaque" rgba="1 1 1 1"/></asset><worldbody>
   <camera name="down" pos="0 0 2" fovy="60"/>
+  <camera name="turned" pos="0 0 2" mode="targetbody" target="b"/>
   <geom type="plane" size="5 5 1"/>
-  <body><camera name="carried"/><geom type="sphere" size="0.3" pos="0.4 0.3 0.5"/></body>
+  <body name="b"><camera name="carried"/><geom type="sphere" size="0.3" pos="0.4 0.3 0.5"/></body>
   <body><geom name="cube" type="box" size="0.2 0.2 0.2" pos="-0.5 -0.3 0.2"/></body>
   <body><geom name="hidden by the floor" type="sphere" size="0.1" pos="0.4 -0.4 -0.3"/></body>
   <geom type="box" size="0.2 0.2 0.2" pos="0 0 1.5" rgba="1 0 0 0" material="opaque"/>
@@ -157,8 +158,9 @@ def test_a_marker_above_the_workspace_hides_nothing_in_it():
 
 
 def test_a_camera_that_could_only_be_silent_is_refused():
-    with pytest.raises(ValueError, match="'carried' moves with a body"):
-        scene(8, ((-1, -1, -1), (1, 1, 1)), "carried")
+    for name in ("carried", "turned"):
+        with pytest.raises(ValueError, match=f"'{name}' moves with a body"):
+            scene(8, ((-1, -1, -1), (1, 1, 1)), name)
     with pytest.raises(ValueError, match="'down' does not see the workspace"):
         scene(8, ((-1, -1, 3), (1, 1, 4)))
 

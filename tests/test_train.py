@@ -607,6 +607,18 @@ def test_an_existing_run_is_neither_overwritten_nor_resumed_with_other_settings(
     assert fingerprint(run) == before
 
 
+def test_a_folder_without_recordings_is_not_filled_with_others(tmp_path, capsys):
+    folder, file = tmp_path / "mine", tmp_path / "stir.npz"
+    folder.mkdir()
+    file.touch()
+    tiny = ["--preset", "tiny", "--data"]
+    assert "mine holds no recordings (.npz)" in fails(train, [*tiny, folder], capsys)
+    assert "stir.npz is a file: name its folder" in fails(train, [*tiny, file], capsys)
+    message = fails(train, ["--suite", "ml10", "--out", file / "run"], capsys)
+    assert "stir.npz/run: not a directory, name another file or folder" in message
+    assert not list(folder.iterdir())
+
+
 def test_what_cannot_be_resumed_is_said(run, recorded, tmp_path, capsys):
     argv = ["--data", recorded, *FEW]
     message = fails(train, [*argv, "--out", tmp_path / "mistyped", "--resume"], capsys)
