@@ -49,8 +49,9 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-dami": "DAMI",
     "ml10-first-order": "DAMI, first order",
     "ml10-first-order-3e-2": "DAMI, first order, with an inner rate of 3e-2",
+    "ml10-dami-cpu": "DAMI, trained on the CPU",
     "ml10-no-inner-loop": "without the inner loop",
-    "ml10-no-inner-loop-cpu": "without the inner loop, trained on two cores",
+    "ml10-no-inner-loop-cpu": "without the inner loop, trained on the CPU",
     "ml10-mlp": "without the inner loop, an MLP for VMT",
     "ml10-no-demonstration": "without a demonstration",
     "ml10-neither": "without both: multi-task training",
@@ -79,7 +80,7 @@ POLICIES = {  # of baselines.py -> what the paper calls it
 ABLATION = {  # a row of the paper's ablation -> our variant, and what it is
     "baseline": ("baseline", "an MLP for VMT, no TCFM: the paper's Baseline"),
     "+vmt": ("vmt", "VMT, no TCFM"),
-    "+tcfm-down": ("no-inner-loop", "VMT, TCFM in the first down-sampling level"),
+    "+tcfm-down": ("no-inner-loop-cpu", "VMT, TCFM in the first down-sampling level"),
     "+tcfm-mid": ("mid", "VMT, TCFM in the middle"),
     "+tcfm-up": ("up", "VMT, TCFM in the last up-sampling level"),
 }
