@@ -510,3 +510,18 @@ def test_what_the_user_gets_wrong_ends_in_one_line_and_exit_code_2(argv, message
         command_line(lambda: simulator.main([*argv, "--data", str(tmp_path)]))
     error = capsys.readouterr().err
     assert end.value.code == 2 and message in error and error.count("\n") == 1
+
+
+def test_the_oracle_tells_a_worker_where_object_and_goal_are(tmp_path):
+    argv = f"positions simulator.py --task push --episodes 1 --workers 1 --data {tmp_path}"
+    subprocess.run([sys.executable, "-m", "tests.oracle", *argv.split()], check=True, cwd=ROOT)
+    told = load_demonstrations(tmp_path / "push.npz")
+    env = MetaWorldPointCloudEnv("push")
+    env.begin(told.meta["episode_seeds"][0])
+    positions = np.concatenate([env.raw[4:7], env.raw[-3:]])
+    assert told.state.shape == (200, 15) and told.meta["positions_in_state"] == 5
+    np.testing.assert_allclose(told.state[0, 9:], positions, atol=1e-6)
+    moved = np.abs(told.state[-1, 9:] - told.state[0, 9:])
+    assert moved[:3].max() > 0.05 and moved[3:].max() == 0  # the puck, not its goal
+    with pytest.raises(ValueError, match="recorded with another positions_in_state"):
+        collect(["push"], tmp_path, episodes=1)
