@@ -155,7 +155,7 @@ def save_demonstrations(path: str | Path, demonstrations: Demonstrations) -> Non
 def load_demonstrations(path: str | Path) -> Demonstrations:
     """Reads what `save_demonstrations`, or a recorder of your own, wrote.
 
-    Raises ValueError, one line, for a file that is missing, damaged, inconsistent or not finite.
+    Raises ValueError, one line: missing, damaged, inconsistent, not finite; OSError: unreadable.
     """
     path = Path(path)
     if not path.is_file():

@@ -236,12 +236,12 @@ def action_error(
         newest = torch.arange(episode.start, episode.stop, Ta)[:, None]  # (n, 1) frames
         seen = (newest + torch.arange(1 - To, 1)).clamp(episode.start)  # (n, To)
         done = newest + torch.arange(Ta)  # (n, Ta), the last of them perhaps beyond the episode
+        inside = done < episode.stop
         points, state = unseen.points[seen].float(), unseen.state[seen]
-        drawn = policy.sample_actions(
-            points.to(text.device), state.to(text.device), context, generator
-        )  # (n, Ta, A)
-        acted = unseen.action[done[done < episode.stop]]  # (frames, A)
-        errors.append((drawn.to(acted.device)[done < episode.stop] - acted).abs().flatten())
+        both = points.to(text.device), state.to(text.device)
+        drawn = policy.sample_actions(*both, context, generator)  # (n, Ta, A)
+        acted = unseen.action[done[inside]]  # (frames, A)
+        errors.append((drawn.to(acted.device)[inside] - acted).abs().flatten())
         plain.append((shown.action.mean(dim=0).to(acted.device) - acted).abs().flatten())
     return torch.cat(errors).mean().item(), torch.cat(plain).mean().item()
 
@@ -571,7 +571,7 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError(f"{checkpoint} was made with text weights {each['text_weights']!r}")
         if each.get("adapted_to", tasks[0]) != tasks[0] or ("adapted_to" in each and tasks[1:]):
             raise ValueError(f"{checkpoint} was adapted to {each['adapted_to']}: measure it alone")
-        if is_told(each) != is_told(info):
+        if scripts.is_told(each) != scripts.is_told(info):
             raise ValueError(f"{checkpoint}: with --no-instruction or without, not both at once")
     out = Path(args.out)
     with nullcontext() if args.gif else scripts.locked(out):
@@ -579,7 +579,7 @@ def main(argv: list[str] | None = None) -> None:
         paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
         n, how = args.demonstrations, (args.clip_weights, info["text_weights"], device)
         recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
-        told = is_told(info) and "instruction" not in args.without
+        told = scripts.is_told(info) and "instruction" not in args.without
         text, identity = scripts.instruction_features(recorded, *how, told=told)
         for file in old:
             file.unlink()
@@ -599,11 +599,6 @@ def main(argv: list[str] | None = None) -> None:
         if args.without:
             facts["without"] = " and ".join(args.without)
         measure(args, suite, runs, labels, paths, text, device, facts)
-
-
-def is_told(info: dict[str, Any]) -> bool:
-    """Whether the policy of a checkpoint is told its instruction: unless it was adapted without."""
-    return info.get("adaptation", {}).get("instruction", True)
 
 
 def measure(

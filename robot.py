@@ -943,7 +943,7 @@ class Cell:
         return Frame(time.monotonic(), points, seen, state)
 
     def prepare(self, moves: bool) -> None:
-        """Camera, gripper and arm must answer before anything moves, the gripper first."""
+        """Camera, gripper and arm must answer before anything moves; then readies the gripper."""
         self.observe()
         if reason := self.rtde.state(self.settings.max_state_age_s).trouble():
             raise RobotError(f"the arm is not moved: {reason}")
@@ -1029,7 +1029,7 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
         raise ValueError(f"{args.checkpoint} was adapted to {task}, {args.data} is of another task")
     sampler = data.WindowSampler(recording, config, args.device)
     text, _ = text_features([recording.instruction], args.clip_weights, info["text_weights"])
-    text = text * info.get("adaptation", {}).get("instruction", True)  # zeros: adapted without it
+    text = text * scripts.is_told(info)
     torch.set_num_threads(max(1, (os.cpu_count() or 1) - 1))  # a core is left to the servo stream
     generator = torch.Generator().manual_seed(args.seed)
     demo = sampler.demonstration(sampler.draw_episode(generator))  # held for the whole run
@@ -1106,7 +1106,9 @@ def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callabl
                     if step < len(chunk) and behind > 1 / settings.policy_hz:
                         servo.hold()  # the gripper must act where the arm was to be then
                     if servo.broken_off and args.command == "replay":
-                        raise RobotError("camera or gripper were late: what follows would be moved")
+                        raise RobotError(
+                            "camera or gripper were late: the rest would begin elsewhere"
+                        )
                     if servo.broken_off:
                         break
         except BaseException as error:  # Ctrl-C, too

@@ -229,7 +229,7 @@ def pick_device(name: str | None, threads: int | None = None) -> torch.device:
         ) from error
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")  # TF32, as PyTorch has convolutions anyway
-        torch.cuda.set_device(device if device.index is not None else 0)  # streams and graphs, too
+        torch.cuda.set_device(device.index or 0)  # for streams and graphs
     return device
 
 
@@ -286,6 +286,11 @@ def choose_config(
 def windows(recorded: dict[str, Demonstrations], *how: Any) -> dict[str, WindowSampler]:
     """The windows of each task's recording; `how` as WindowSampler takes it."""
     return {task: WindowSampler(d, *how) for task, d in recorded.items()}
+
+
+def is_told(info: dict[str, Any]) -> bool:
+    """Whether a checkpoint's policy is told its instruction: unless it was adapted without."""
+    return info.get("adaptation", {}).get("instruction", True)
 
 
 def instruction_features(

@@ -284,6 +284,11 @@ def length_table(results: dict) -> str:
     return format_table(rows)
 
 
+def pairs(one: Successes, other: Successes) -> list[tuple[bool, bool]]:
+    """What two policies made of each episode."""
+    return [pair for task in one for pair in zip(one[task], other[task])]
+
+
 def limits_table(results: dict) -> str:
     """What multi-task training succeeds in when it is given something, seed 0 of each."""
     rows = [["given", "base tasks", "won, lost against the first"]]
@@ -291,8 +296,8 @@ def limits_table(results: dict) -> str:
     for variant, title in LIMITS.items():
         found = measured(results.get(f"ml10-{variant}-seed0", {}), "limits")
         if found:
-            pairs = [pair for task in plain for pair in zip(found[task], plain[task])]
-            against = f"{pairs.count((True, False))}, {pairs.count((False, True))}"
+            outcomes = pairs(found, plain)
+            against = f"{outcomes.count((True, False))}, {outcomes.count((False, True))}"
             rows.append([title, pooled_success(found), against if variant != "neither" else ""])
     return format_table(rows)
 
@@ -449,13 +454,13 @@ def compare(results: dict, one: str, other: str) -> str:
     """
     rows = [["report", "won", "lost", "episodes", "p"]]
     names = [name for name in results if name.startswith(f"{one}-seed")]
-    pairs = [(results[name], results.get(name.replace(one, other, 1), {})) for name in names]
+    both = [(results[name], results.get(name.replace(one, other, 1), {})) for name in names]
     for name in (name for name in REPORTS if not name.endswith(AGAIN)):
         outcomes = []
-        for pair in pairs:
+        for pair in both:
             columns = [on_all_goals(r, name, "after") or on_all_goals(r, name) for r in pair]
             if all(columns):
-                outcomes += [p for task in columns[0] for p in zip(*(c[task] for c in columns))]
+                outcomes += pairs(*columns)
         if outcomes:
             won, lost = outcomes.count((True, False)), outcomes.count((False, True))
             p = binomtest(won, won + lost).pvalue if won + lost else 1.0

@@ -104,10 +104,8 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
 
     resume = " --resume" if (run / "last.pt").exists() else ""
     steps = int(re.findall(r"--steps (\d+)", f"--steps {steps} {flags}")[-1])
-    trained = (
-        f"{world}train.py --suite {suite} --preset small --seed {seed} --episodes 0 --out {run}"
-    )
-    trained += f" --threads 1 --steps {steps} --clip-weights random {flags}{resume}"
+    trained = f"{world}train.py --suite {suite} --preset small --seed {seed} --episodes 0"
+    trained += f" --out {run} --threads 1 --steps {steps} --clip-weights random {flags}{resume}"
     listed = [Job(trained, run / f"ema-{steps:05d}.pt", run.with_suffix(".log"))]
     for name, (command, variants) in REPORTS.items():
         if variant in variants or (not variants and variant not in LIMITS):

@@ -879,8 +879,12 @@ def test_frames_without_depth_are_no_traceback():
     camera = object.__new__(robot.RealSense)
     empty = type("Empty", (), {"__bool__": lambda self: False})()
     frames = type("Frames", (), {"get_depth_frame": lambda self: empty})()
-    asked = lambda self, ms: time.sleep(ms / 1000) or (True, frames)  # noqa: E731
-    camera.pipeline = type("Pipeline", (), {"try_wait_for_frames": asked})()
+
+    def wait(self, ms):
+        time.sleep(ms / 1000)
+        return True, frames
+
+    camera.pipeline = type("Pipeline", (), {"try_wait_for_frames": wait})()
     with pytest.raises(robot.CameraError, match="no depth for a second"):
         camera.read()
 
