@@ -80,9 +80,7 @@ class PolicyConfig:
 
         layers = self.vmt_layers + self.u2t_layers
         if () in (self.pointnet_widths, self.unet_widths) or layers > 99 or self.timestep_dim < 4:
-            raise ValueError(
-                "networks need widths, timestep_dim >= 4, VMT and U2T at most 99 layers"
-            )
+            raise ValueError("networks need widths, timestep_dim >= 4, VMT and U2T <= 99 layers")
         for name, value in vars(self).items():
             if isinstance(value, int) and not 1 <= value <= 100_000:
                 raise ValueError(f"{name} is {value}: use at least 1, at most 100000")

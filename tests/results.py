@@ -422,7 +422,8 @@ def draw_adaptation(results: dict, path: Path) -> None:
             rates = np.array([np.mean(e) for _, e in curve])
             error = 100 * np.abs(np.array(bounds).T - rates)  # (2, points)
             line = {"marker": "o", "markersize": 4, "capsize": 2, "linewidth": 1.5}
-            axes.errorbar([x for x, _ in curve], 100 * rates, error, label=title, **line)
+            line["label"] = SHOWN["ml10"].get(variant, title)
+            axes.errorbar([x for x, _ in curve], 100 * rates, error, **line)
         axes.set_xscale("symlog", linthresh=1)
         axes.set_xticks([x for x, *_ in points], [x for x, *_ in points], fontsize=7)
         axes.minorticks_off()
