@@ -1,4 +1,4 @@
-"""What better eyes would buy: a command of the repository, where more can be seen.
+"""What better eyes, or another constant, would buy: a command of the repository in another world.
 
     python -m tests.oracle positions simulator.py --data data-positions
     python -m tests.oracle positions train.py --data data-positions --out runs/positions
@@ -6,7 +6,9 @@
     python -m tests.oracle pixels train.py --data data-pixels --out runs/pixels
 
 `positions`: the state also holds where the object and the goal truly are. `pixels`: the camera
-casts four times as many rays. Recordings, and checkpoints, are of one of these worlds.
+casts four times as many rays. Recordings, and checkpoints, are of one of these two.
+`augmented-twice`: scenes are turned and stretched up to twice as much in training.
+`not-averaged`: what is kept are the weights themselves, in place of their moving average.
 """
 
 import argparse
@@ -16,10 +18,13 @@ from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
+from torch.optim.swa_utils import AveragedModel
 
 import baselines
+import data
 import scripts
 import simulator
+import train
 from scripts import command_line
 from simulator import MetaWorldPointCloudEnv
 
@@ -48,11 +53,23 @@ def pixels() -> None:
     simulator.RECIPE["camera"][2] *= 2
 
 
+def augmented_twice() -> None:
+    """Doubles the turns and the stretch of a training's scenes."""
+    data.TURN *= 2
+    data.STRETCH *= 2
+
+
+def not_averaged() -> None:
+    """Makes a training's moving average one of the last weights alone."""
+    train.ema_model = lambda policy: AveragedModel(policy, avg_fn=lambda mean, last, n: last)
+
+
 WORLDS = {"positions": positions, "pixels": pixels}
+WORLDS |= {"augmented-twice": augmented_twice, "not-averaged": not_averaged}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Runs a command where more can be seen.")
+    parser = argparse.ArgumentParser(description="Runs a command in another world.")
     parser.add_argument("world", choices=WORLDS)
     parser.add_argument("command", choices=("simulator.py", "train.py", "evaluate.py"))
     parser.add_argument("flags", nargs=argparse.REMAINDER, help="the command's")

@@ -94,6 +94,16 @@ LIMITS = {  # what multi-task training may lack -> what it is given
     "pixels": "168 x 168 rays",
     "positions": "the true positions of object and goal, in the state",
 }
+TUNING = {  # a short multi-task training -> what it is
+    "4000-steps": "`small` as it is, but 4000 steps of 16 windows a task",
+    "lr-5e-4": "half the learning rate (5e-4)",
+    "lr-2e-3": "twice the learning rate (2e-3)",
+    "batch-8": "8000 steps of 8 windows",
+    "batch-32": "2000 steps of 32 windows",
+    "not-augmented": "scenes as they are (`--no-augment`)",
+    "augmented-twice": "scenes turned and stretched twice as much",
+    "not-averaged": "the last weights, not their moving average",
+}
 SHOWN = {  # a suite -> the columns of its tables: a variant, and what it is called there
     "ml10": {
         "ml10-dami": "DAMI",
@@ -289,17 +299,22 @@ def pairs(one: Successes, other: Successes) -> list[tuple[bool, bool]]:
     return [pair for task in one for pair in zip(one[task], other[task])]
 
 
-def limits_table(results: dict) -> str:
-    """What multi-task training succeeds in when it is given something, seed 0 of each."""
-    rows = [["given", "base tasks", "won, lost against the first"]]
-    plain = measured(results["ml10-neither-seed0"], "limits")
-    for variant, title in LIMITS.items():
-        found = measured(results.get(f"ml10-{variant}-seed0", {}), "limits")
-        if found:
-            outcomes = pairs(found, plain)
-            against = f"{outcomes.count((True, False))}, {outcomes.count((False, True))}"
-            rows.append([title, pooled_success(found), against if variant != "neither" else ""])
-    return format_table(rows)
+def limits_table(titles: dict[str, str], first: str) -> Callable[[dict], str]:
+    """A row a variant of `titles`, seed 0 of each, beside the first: on goals of no result."""
+
+    def make(results: dict) -> str:
+        rows = [[first, "base tasks", "won, lost against the first"]]
+        found = {v: measured(results.get(f"ml10-{v}-seed0", {}), "limits") for v in titles}
+        plain = found[next(iter(titles))]
+        for variant, successes in found.items():
+            if successes:
+                outcomes = pairs(successes, plain)
+                counts = f"{outcomes.count((True, False))}, {outcomes.count((False, True))}"
+                against = counts if successes is not plain else ""
+                rows.append([titles[variant], pooled_success(successes), against])
+        return format_table(rows)
+
+    return make
 
 
 def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
@@ -360,7 +375,8 @@ TABLES = {
     "policies": policies_table,
     "ablation": ablation_table,
     "length": length_table,
-    "limits": limits_table,
+    "limits": limits_table(LIMITS, "given"),
+    "tuning": limits_table(TUNING, "trained"),
     "ml45 means": lambda results: means_table(results, "ml45"),
     "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),
     "ml45 novel": by_task_table("novel", "ml45"),

@@ -51,7 +51,19 @@ LIMITS = {  # what more demonstrations, points, or eyes would buy; measured on b
     "positions": "--data data-positions",
     "pixels": "--data data-pixels",
 }
+SHORT = f"{VARIANTS['neither']} --steps 4000"
+TUNING = {  # two fifths of the steps, or as many windows; measured as LIMITS are
+    "4000-steps": "",
+    "lr-5e-4": "--lr 5e-4",
+    "lr-2e-3": "--lr 2e-3",
+    "batch-8": "--support 2 --query 6 --steps 8000",
+    "batch-32": "--support 8 --query 24 --steps 2000",
+    "not-augmented": "--no-augment",
+    "augmented-twice": "",
+    "not-averaged": "",
+}
 VARIANTS |= {name: f"{VARIANTS['neither']} {flags}" for name, flags in LIMITS.items()}
+VARIANTS |= {name: f"{SHORT} {flags}" for name, flags in TUNING.items()}
 
 SEED = 1  # of the evaluation's goals: that of no training, and of no choice that was made
 EPISODES = 50
@@ -59,7 +71,8 @@ READS = ("dami", "no-inner-loop")  # a demonstration: may go without the instruc
 LONGER = ("neither", "twice-as-long")
 DECIDE = (*READS, "no-demonstration", "neither")
 SHOWN = (*READS, "neither", "scratch")
-REPORTS = {  # name -> command, of which variants (): all but LIMITS; {run} is the run's folder
+REPORTED = [name for name in VARIANTS if name not in LIMITS | TUNING]
+REPORTS = {  # name -> command, of which variants, (): of REPORTED; {run} is the run's folder
     "base": ("evaluate.py --checkpoint {run}", ()),
     "novel": ("finetune.py --task novel --checkpoint {run}", ()),
     "told": ("evaluate.py --checkpoint {run} --swap demonstration instruction", READS),
@@ -70,7 +83,7 @@ REPORTS = {  # name -> command, of which variants (): all but LIMITS; {run} is t
 }
 AGAIN = "-goals2"  # the same report on 50 other goals
 REPORTS |= {name + AGAIN: (f"{REPORTS[name][0]} --seed 2", DECIDE) for name in ("base", "novel")}
-REPORTS["limits"] = (f"{REPORTS['base'][0]} --seed 10", (*LONGER, *LIMITS))
+REPORTS["limits"] = (f"{REPORTS['base'][0]} --seed 10", (*LONGER, *LIMITS, *TUNING))
 # Along the adaptation, and with fewer demonstrations: 20 episodes.
 CURVE = {"curve": "--curve 1 5 20 50", "long": "--steps 1000 --curve 500"}
 CURVE |= {f"{n}-shot": f"--demonstrations {n}" for n in (1, 3, 5)}
@@ -100,7 +113,8 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
     run, flags = Path(f"runs/{suite}-{variant}-seed{seed}"), VARIANTS[variant]
     world, data = "", ""
     if variant in WORLDS:
-        world, data = f"-m tests.oracle {variant} ", f" --data data-{variant}"
+        world = f"-m tests.oracle {variant} "
+        data = "".join(re.findall(r" --data \S+", flags))
 
     resume = " --resume" if (run / "last.pt").exists() else ""
     steps = int(re.findall(r"--steps (\d+)", f"--steps {steps} {flags}")[-1])
@@ -108,7 +122,7 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
     trained += f" --out {run} --threads 1 --steps {steps} --clip-weights random {flags}{resume}"
     listed = [Job(trained, run / f"ema-{steps:05d}.pt", run.with_suffix(".log"))]
     for name, (command, variants) in REPORTS.items():
-        if variant in variants or (not variants and variant not in LIMITS):
+        if variant in (variants or REPORTED):
             out = Path(f"{run}-{name}")
             script, words = command.format(run=run).split(" ", 1)
             measured = f"{world}{script} --episodes {episodes} --seed {SEED} {words}{data}"

@@ -8,8 +8,8 @@ import pytest
 
 from report import wilson_interval
 from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
-from tests.runs import LIMITS, LONGER, VARIANTS
-from train import SETTINGS
+from tests.runs import LIMITS, LONGER, TUNING, VARIANTS
+from train import SETTINGS, parse
 
 HELD = json.loads(RESULTS.read_text())
 
@@ -53,14 +53,13 @@ def test_runs_are_of_the_variants_that_they_name():
         suite, variant, seed = re.fullmatch(r"(ml\d\d-)?(.*)-seed(\d)", name).groups()
         variant = variant.removesuffix("-eight").removesuffix("-cpu")
         arguments, config = run["training"]["arguments"], run["training"]["config"]
-        steps = {"scratch": 1, "twice-as-long": 20_000}.get(
-            variant, 5_000 if suite == "ml45-" else 10_000
-        )
+        stated = re.findall(r"--steps (\d+)", VARIANTS.get(variant, ""))
+        steps = int(stated[-1]) if stated else 5_000 if suite == "ml45-" else 10_000
         assert arguments["seed"] == int(seed) and arguments["steps"] == steps
         assert arguments["suite"] == (suite or "ml10-")[:-1]
         policy = variant.removesuffix("-maml")
         assert config.get("policy", "dami") == (policy if policy in POLICIES else "dami")
-        multi_task = variant in (*LONGER, *LIMITS, *POLICIES)
+        multi_task = variant in (*LONGER, *LIMITS, *TUNING, *POLICIES)
         off = "--maml off" in VARIANTS.get(variant.removeprefix("before-"), "")
         assert (arguments["maml"] == "off") == off
         silent = config["demo_encoder"] == "none"
@@ -68,13 +67,13 @@ def test_runs_are_of_the_variants_that_they_name():
         always_told = arguments.get("instruction_dropout", 0) == 0
         assert always_told == (variant.startswith("before") or silent)
         assert variant in VARIANTS or variant.startswith("before")
-        flags = re.sub(r"--data \S+", "", VARIANTS.get(variant, "")).split()
-        flags = dict(zip(flags[::2], flags[1::2]))
+        flags = vars(parse(re.sub(r"--data \S+", "", VARIANTS.get(variant, "")).split()))
         if variant in VARIANTS and arguments["maml"] != "off":
-            flags.setdefault("--inner-lr", SETTINGS["small"].inner_lr)
+            flags["inner_lr"] = flags["inner_lr"] or SETTINGS["small"].inner_lr
         for flag, value in flags.items():
-            used = (arguments | config).get(flag[2:].replace("-", "_"), "dami")
-            assert used == type(used)(value), (name, flag)
+            if value is not None and flag != "resume":
+                used = (arguments | config).get(flag, "dami")
+                assert used == value, (name, flag)
 
 
 def test_every_result_says_how_it_was_measured():

@@ -36,6 +36,7 @@ import model
 import report
 import scripts
 import train
+from tests import oracle
 
 ROOT = Path(train.__file__).resolve().parent
 pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
@@ -79,6 +80,25 @@ def test_training_begins_with_the_papers_adamw_over_every_parameter():
     assert isinstance(optimizer, torch.optim.AdamW) and group["lr"] == 0.25
     assert group["betas"] == (0.95, 0.999) and group["weight_decay"] == 1e-6
     assert set(map(id, group["params"])) == set(map(id, policy.parameters()))
+
+
+def test_the_oracle_keeps_the_last_weights_and_moves_scenes_twice_as_much(monkeypatch):
+    middle, drawn, kept = torch.zeros(1, 3), [], []
+    policy = torch.nn.Linear(1, 1)
+    for attribute, module in {"TURN": data, "STRETCH": data, "ema_model": train}.items():
+        monkeypatch.setattr(module, attribute, getattr(module, attribute))  # undone at the end
+    for _ in range(2):
+        a, _ = data.draw_affine_maps(1000, middle, torch.Generator().manual_seed(0))
+        drawn.append((a - torch.eye(3)).flatten(1).norm(dim=1).mean())
+        average = train.ema_model(policy)
+        for weight in (1.0, 2.0, 3.0):
+            torch.nn.init.constant_(policy.weight, weight)
+            average.update_parameters(policy)
+        kept.append(average.module.weight.item())
+        oracle.augmented_twice()
+        oracle.not_averaged()
+    assert drawn[1] / drawn[0] == pytest.approx(2, abs=0.1)
+    assert 1 < kept[0] < 3 and kept[1] == 3
 
 
 def test_support_and_query_are_disjoint_and_share_the_demonstration(recorded):
