@@ -93,6 +93,7 @@ LIMITS = {  # what multi-task training may lack -> what it is given
     "points-256": "256 points",
     "pixels": "168 x 168 rays",
     "positions": "the true positions of object and goal, in the state",
+    "unmoved": "scenes as they are (`--no-augment`)",
 }
 TUNING = {  # a short multi-task training -> what it is
     "4000-steps": "`small` as it is, but 4000 steps of 16 windows a task",

@@ -43,11 +43,12 @@ VARIANTS = {
 }
 VARIANTS |= {policy: f"--policy {policy} --maml off" for policy in ("dp3", "flow", "mamba", "freq")}
 VARIANTS |= {f"{policy}-maml": f"--policy {policy}" for policy in ("dp3", "flow", "mamba", "freq")}
-LIMITS = {  # what more demonstrations, points, or eyes would buy; measured on base tasks alone
+LIMITS = {  # what more or less of something would buy; measured on base tasks alone
     "30-demonstrations": "--demonstrations 30 --data data30",
     "100-demonstrations": "--demonstrations 100 --data data100",
     "points-64": "--num-points 64",
     "points-256": "--num-points 256",
+    "unmoved": "--no-augment",
     "positions": "--data data-positions",
     "pixels": "--data data-pixels",
 }
