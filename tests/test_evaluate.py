@@ -20,8 +20,8 @@ import model
 import report
 import scripts
 import simulator
+import tests.unseen
 import train
-from tests import unseen
 
 pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
 
@@ -497,16 +497,19 @@ def test_a_policy_that_fits_its_demonstrations_has_a_small_action_error():
     assert after < 0.3 * plain < before
 
 
-def test_checkpoints_are_judged_on_episodes_that_no_training_saw(run, recorded, capsys):
-    folders = ["--data", str(recorded), "--unseen", str(recorded)]
-    unseen.main([str(run), str(run / "ema-00006.pt"), *folders])
+def test_checkpoints_are_judged_on_episodes_that_no_training_saw(run, recorded, own_folder, capsys):
+    held = {task: data.load_demonstrations(recorded / f"{task}.npz") for task in BASE}
+    shown = {task: demonstrations.take(1) for task, demonstrations in held.items()}
+    for task, demonstrations in shown.items():
+        data.save_demonstrations(own_folder / f"{task}.npz", demonstrations)
+    folders = ["--data", str(own_folder), "--unseen", str(recorded)]
+    tests.unseen.main([str(run), str(run / "ema-00006.pt"), *folders])
     rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines()[2:]]
     files = [run / "ema-00003.pt", *2 * [run / "ema-00006.pt"]]
     assert [Path(row[0].strip()) for row in rows] == files
     policy, info = scripts.load_checkpoint(files[-1])
-    shown = {task: data.load_demonstrations(recorded / f"{task}.npz") for task in BASE}
     text, _ = scripts.instruction_features(shown, None, info["text_weights"], "cpu")
-    windows = scripts.windows(shown, policy.config)
-    errors = [evaluate.action_error(policy, *2 * [windows[t]], text[t]) for t in BASE]
+    shown, held = (scripts.windows(part, policy.config) for part in (shown, held))
+    errors = [evaluate.action_error(policy, shown[t], held[t], text[t]) for t in BASE]
     expected = [f"{mean:.4f}" for mean in np.mean(errors, axis=0)]
     assert [cell.strip() for cell in rows[-1][1:]] == expected and rows[1] == rows[2] != rows[0]

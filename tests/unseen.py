@@ -7,10 +7,12 @@ The error is `evaluate.action_error`, the mean over the base tasks of ML10.
 """
 
 import argparse
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import scripts
 from data import load_demonstrations
@@ -33,11 +35,15 @@ def main(argv: list[str] | None = None) -> None:
         for folder in (args.data, args.unseen)
     )
 
+    @cache
+    def features(identity: str) -> dict[str, torch.Tensor]:
+        return scripts.instruction_features(seen, None, identity, "cpu")[0]
+
     rows = [["checkpoint", "action error", "of the mean action"]]
     for path in chain(*map(checkpoints_of, args.checkpoints)):
         policy, info = load_checkpoint(path, needs=TRAINED)
         shown, held = (scripts.windows(part, policy.config) for part in (seen, unseen))
-        text, _ = scripts.instruction_features(seen, None, info["text_weights"], "cpu")
+        text = features(info["text_weights"])
         errors = [action_error(policy, shown[task], held[task], text[task]) for task in tasks]
         rows.append([str(path), *(f"{mean:.4f}" for mean in np.mean(errors, axis=0))])
     print(scripts.format_table(rows))
