@@ -160,10 +160,8 @@ def made_by_simulator(demonstrations: Demonstrations) -> bool:
     return "simulator" in demonstrations.meta
 
 
-def check_recipe(
-    demonstrations: Demonstrations, path: str | Path, recipe: dict[str, Any]
-) -> Demonstrations:
-    """Returns a recording whose meta has all that `recipe` has; UserError otherwise."""
+def check_recipe(demonstrations: Demonstrations, path: str | Path, recipe: dict[str, Any]) -> None:
+    """Raises UserError for a recording, read from `path`, that was not made by this recipe."""
     if not made_by_simulator(demonstrations):
         raise UserError(
             f"{path} was recorded by an older version, or is a recording of your own: "
@@ -174,7 +172,6 @@ def check_recipe(
         raise UserError(
             f"{path} was recorded with another {', '.join(changed)}: move it or use another --data"
         )
-    return demonstrations
 
 
 # ---- Collecting demonstrations of the scripted experts -------------------------------------------
@@ -306,6 +303,7 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
         success_frames.append(success_frame)
         report_progress(task, 1)
 
+    packages = (*simulator.packages, "fpsample", "numpy")
     demonstrations = Demonstrations(
         task=task,
         instruction=simulator.instructions[task],
@@ -321,9 +319,7 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
             "success_frames": success_frames,
             "expert_success_rate": episodes / attempts,
             "seconds": round(time.perf_counter() - start, 1),
-            "versions": {
-                name: version(name) for name in (*simulator.packages, "fpsample", "numpy")
-            },
+            "versions": {package: version(package) for package in packages},
         },
     )
     save_demonstrations(path, demonstrations)
