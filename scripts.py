@@ -43,6 +43,7 @@ from tqdm import tqdm
 
 from baselines import PRESETS, build_policy
 from clip import text_features
+from common import UserError  # until train.py, finetune.py and evaluate.py use common.command_line
 from data import Demonstrations, WindowSampler, write_atomically, write_text
 from model import CHOICES, DAMIPolicy, PolicyConfig
 
@@ -193,7 +194,7 @@ def command_line(main: Callable[[], None], *errors: type[Exception]) -> None:
         return main()
     except KeyboardInterrupt as interrupt:
         line, code = f"interrupted{f': {interrupt}' if str(interrupt) else ''}", 130
-    except (ValueError, OSError, *errors) as error:
+    except (ValueError, OSError, UserError, *errors) as error:
         if sys.flags.dev_mode:
             raise
         line, code = f"error: {' '.join(str(error).split())}", 2
