@@ -22,8 +22,10 @@ from itertools import islice
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.func import grad, grad_and_value
+from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_map
 
 Params = dict[str, Tensor]
@@ -43,8 +45,8 @@ def adapt(
         batch: anything `loss_fn` understands, usually the support set of a task.
         lr: the inner learning rate alpha.
         steps: gradient steps, all on the same batch.
-        first_order: the inner gradient counts as a constant, so that who differentiates the result
-            sees d theta' / d theta = 1. Cheaper, and a different gradient.
+        first_order: first-order MAML: the inner gradient is treated as a constant. It is cheaper,
+            and it gives a different meta-gradient.
     """
     for _ in range(steps):
         start = {name: p.detach() for name, p in params.items()} if first_order else params
@@ -69,12 +71,16 @@ def meta_gradient(
         loss_fn, params, lr, steps, first_order: as in `adapt`.
         tasks: (support, query) batches, one pair a task. An iterator is read `vectorize` tasks at a
             time, and their graph is freed before the next are read: memory does not grow.
-        vectorize: so many tasks run at once, under `torch.vmap`: the same numbers, up to twice as
-            fast. Their batches must have equal shapes and hold tensors only.
+        vectorize: how many tasks run at once, under `torch.vmap`. The numbers are the same, and it
+            is up to twice as fast. The batches must have equal shapes and hold tensors only.
 
     Returns:
         (gradients, after, before): name -> tensor, and the query losses with the adapted parameters
-        and with the given ones, both (tasks,). Raises ValueError without a task, or `vectorize`.
+        and with the given ones, both (tasks,).
+
+    Raises:
+        ValueError: there is no task, or `vectorize` is less than 1.
+        NotImplementedError: with `vectorize` > 1, `loss_fn` calls one of `WRONG_UNDER_VMAP`.
     """
     if vectorize < 1:
         raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
@@ -92,7 +98,8 @@ def meta_gradient(
             losses = query_losses(params, *chunk[0])[None]
         else:
             support, query = tree_map(lambda *parts: torch.stack(parts), *chunk)
-            losses = torch.vmap(query_losses, in_dims=(None, 0, 0))(params, support, query)
+            with RightUnderVmap():
+                losses = torch.vmap(query_losses, in_dims=(None, 0, 0))(params, support, query)
         return losses[:, 0].sum(), losses  # (tasks, 2)
 
     tasks, total, losses = iter(tasks), None, []
@@ -107,3 +114,113 @@ def meta_gradient(
         raise ValueError("meta_gradient needs at least one task")
     after, before = torch.cat(losses).unbind(dim=1)
     return {name: g / len(after) for name, g in total.items()}, after, before
+
+
+# ---- Where PyTorch's derivatives are wrong under vmap: skip this when reading the method ----------
+#
+# Under `torch.vmap` every task has adapted weights of its own. With such weights PyTorch (2.13)
+# returns a wrong second derivative of layer, batch and instance normalization, and a wrong first
+# derivative of an embedding with `padding_idx`, and raises no error. The other layers of torch.nn
+# were compared one by one: they give the same numbers with and without `vmap`, or raise an error.
+# test_maml.py repeats the comparison.
+
+
+class RightUnderVmap(TorchFunctionMode):
+    """Inside this context the functions named above are computed in a way that has no such error.
+
+    Normalization multiplies by its weight and adds its bias outside PyTorch's function. In an
+    embedding the row of `padding_idx` is detached.
+    """
+
+    def __torch_function__(
+        self, func: Callable, types: Any, args: tuple = (), kwargs: dict | None = None
+    ) -> Any:
+        if func in WRONG_UNDER_VMAP:
+            raise NotImplementedError(
+                f"torch.{func.__name__} has wrong derivatives under torch.vmap: "
+                "use the function of the same purpose in torch.nn.functional, or vectorize=1"
+            )
+        return REWRITTEN.get(func, func)(*args, **(kwargs or {}))
+
+
+def layer_norm(
+    input: Tensor,
+    normalized_shape: list[int],
+    weight: Tensor | None = None,
+    bias: Tensor | None = None,
+    eps: float = 1e-5,
+) -> Tensor:
+    return scale_and_shift(F.layer_norm(input, normalized_shape, eps=eps), weight, bias)
+
+
+def batch_norm(
+    input: Tensor,
+    running_mean: Tensor | None,
+    running_var: Tensor | None,
+    weight: Tensor | None = None,
+    bias: Tensor | None = None,
+    *options: Any,
+    **named_options: Any,
+) -> Tensor:
+    normalized = F.batch_norm(
+        input, running_mean, running_var, None, None, *options, **named_options
+    )
+    return scale_and_shift(normalized, per_channel(weight, input), per_channel(bias, input))
+
+
+def instance_norm(
+    input: Tensor,
+    running_mean: Tensor | None = None,
+    running_var: Tensor | None = None,
+    weight: Tensor | None = None,
+    bias: Tensor | None = None,
+    *options: Any,
+    **named_options: Any,
+) -> Tensor:
+    normalized = F.instance_norm(
+        input, running_mean, running_var, None, None, *options, **named_options
+    )
+    return scale_and_shift(normalized, per_channel(weight, input), per_channel(bias, input))
+
+
+def embedding(
+    input: Tensor,
+    weight: Tensor,
+    padding_idx: int | None = None,
+    *options: Any,
+    **named_options: Any,
+) -> Tensor:
+    if padding_idx is not None:
+        rows = torch.arange(len(weight), device=weight.device)
+        is_padding = (rows == padding_idx % len(weight))[:, None]  # (rows, 1)
+        weight = torch.where(is_padding, weight.detach(), weight)
+    return F.embedding(input, weight, None, *options, **named_options)
+
+
+def per_channel(x: Tensor | None, like: Tensor) -> Tensor | None:
+    """(channels,) -> (channels, 1, ...), to be multiplied with `like` (B, channels, ...)."""
+    return None if x is None else x.view(-1, *[1] * (like.dim() - 2))
+
+
+def scale_and_shift(x: Tensor, weight: Tensor | None, bias: Tensor | None) -> Tensor:
+    if weight is not None:
+        x = x * weight
+    if bias is not None:
+        x = x + bias
+    return x
+
+
+REWRITTEN = {
+    F.layer_norm: layer_norm,
+    F.batch_norm: batch_norm,
+    F.instance_norm: instance_norm,
+    F.embedding: embedding,
+}
+WRONG_UNDER_VMAP = {  # what the four call themselves
+    torch.layer_norm,
+    torch.native_layer_norm,
+    torch.batch_norm,
+    torch.native_batch_norm,
+    torch.instance_norm,
+    torch.embedding,
+}
