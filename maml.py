@@ -18,6 +18,7 @@ function `loss_fn(params, batch) -> scalar tensor`; with a `torch.nn.Module` tha
 """
 
 from collections.abc import Callable, Iterable
+from inspect import signature
 from itertools import islice
 from typing import Any
 
@@ -80,7 +81,8 @@ def meta_gradient(
 
     Raises:
         ValueError: there is no task, or `vectorize` is less than 1.
-        NotImplementedError: with `vectorize` > 1, `loss_fn` calls one of `WRONG_UNDER_VMAP`.
+        NotImplementedError: with `vectorize` > 1, `loss_fn` calls what PyTorch differentiates
+            wrongly under `vmap`; see the end of this file.
     """
     if vectorize < 1:
         raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
@@ -116,107 +118,16 @@ def meta_gradient(
     return {name: g / len(after) for name, g in total.items()}, after, before
 
 
-# ---- Where PyTorch's derivatives are wrong under vmap: skip this when reading the method ----------
+# ---- Where PyTorch is wrong under vmap: skip this when reading the method ------------------------
 #
 # Under `torch.vmap` every task has adapted weights of its own. With such weights PyTorch (2.13)
-# returns a wrong second derivative of layer, batch and instance normalization, and a wrong first
-# derivative of an embedding with `padding_idx`, and raises no error. The other layers of torch.nn
-# were compared one by one: they give the same numbers with and without `vmap`, or raise an error.
-# test_maml.py repeats the comparison.
+# returns a wrong second derivative of layer, batch and instance normalization, and wrong
+# derivatives of an embedding with `padding_idx` or `scale_grad_by_freq`, and raises no error. The
+# other layers of torch.nn were compared one by one: they give the same numbers with and without
+# `vmap`, or raise an error. tests/test_maml.py repeats the comparison.
 
-
-class RightUnderVmap(TorchFunctionMode):
-    """Inside this context the functions named above are computed in a way that has no such error.
-
-    Normalization multiplies by its weight and adds its bias outside PyTorch's function. In an
-    embedding the row of `padding_idx` is detached.
-    """
-
-    def __torch_function__(
-        self, func: Callable, types: Any, args: tuple = (), kwargs: dict | None = None
-    ) -> Any:
-        if func in WRONG_UNDER_VMAP:
-            raise NotImplementedError(
-                f"torch.{func.__name__} has wrong derivatives under torch.vmap: "
-                "use the function of the same purpose in torch.nn.functional, or vectorize=1"
-            )
-        return REWRITTEN.get(func, func)(*args, **(kwargs or {}))
-
-
-def layer_norm(
-    input: Tensor,
-    normalized_shape: list[int],
-    weight: Tensor | None = None,
-    bias: Tensor | None = None,
-    eps: float = 1e-5,
-) -> Tensor:
-    return scale_and_shift(F.layer_norm(input, normalized_shape, eps=eps), weight, bias)
-
-
-def batch_norm(
-    input: Tensor,
-    running_mean: Tensor | None,
-    running_var: Tensor | None,
-    weight: Tensor | None = None,
-    bias: Tensor | None = None,
-    *options: Any,
-    **named_options: Any,
-) -> Tensor:
-    normalized = F.batch_norm(
-        input, running_mean, running_var, None, None, *options, **named_options
-    )
-    return scale_and_shift(normalized, per_channel(weight, input), per_channel(bias, input))
-
-
-def instance_norm(
-    input: Tensor,
-    running_mean: Tensor | None = None,
-    running_var: Tensor | None = None,
-    weight: Tensor | None = None,
-    bias: Tensor | None = None,
-    *options: Any,
-    **named_options: Any,
-) -> Tensor:
-    normalized = F.instance_norm(
-        input, running_mean, running_var, None, None, *options, **named_options
-    )
-    return scale_and_shift(normalized, per_channel(weight, input), per_channel(bias, input))
-
-
-def embedding(
-    input: Tensor,
-    weight: Tensor,
-    padding_idx: int | None = None,
-    *options: Any,
-    **named_options: Any,
-) -> Tensor:
-    if padding_idx is not None:
-        rows = torch.arange(len(weight), device=weight.device)
-        is_padding = (rows == padding_idx % len(weight))[:, None]  # (rows, 1)
-        weight = torch.where(is_padding, weight.detach(), weight)
-    return F.embedding(input, weight, None, *options, **named_options)
-
-
-def per_channel(x: Tensor | None, like: Tensor) -> Tensor | None:
-    """(channels,) -> (channels, 1, ...), to be multiplied with `like` (B, channels, ...)."""
-    return None if x is None else x.view(-1, *[1] * (like.dim() - 2))
-
-
-def scale_and_shift(x: Tensor, weight: Tensor | None, bias: Tensor | None) -> Tensor:
-    if weight is not None:
-        x = x * weight
-    if bias is not None:
-        x = x + bias
-    return x
-
-
-REWRITTEN = {
-    F.layer_norm: layer_norm,
-    F.batch_norm: batch_norm,
-    F.instance_norm: instance_norm,
-    F.embedding: embedding,
-}
-WRONG_UNDER_VMAP = {  # what the four call themselves
+NORMALIZATIONS = {F.layer_norm, F.batch_norm, F.instance_norm}  # what the layers of torch.nn call
+REFUSED = {  # what those call themselves, in case a loss calls it directly
     torch.layer_norm,
     torch.native_layer_norm,
     torch.batch_norm,
@@ -224,3 +135,42 @@ WRONG_UNDER_VMAP = {  # what the four call themselves
     torch.instance_norm,
     torch.embedding,
 }
+
+
+class RightUnderVmap(TorchFunctionMode):
+    """Inside this context normalization has its right derivatives, and an embedding, or an error.
+
+    NotImplementedError is raised where the derivatives would be wrong.
+    """
+
+    def __torch_function__(
+        self, func: Callable, types: Any, args: tuple = (), kwargs: dict | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func in NORMALIZATIONS:
+            return normalize_then_scale(func, *args, **kwargs)
+        if func is F.embedding:
+            options = signature(func).bind(*args, **kwargs).arguments
+            refused = options.get("padding_idx") is not None or options.get("scale_grad_by_freq")
+        else:
+            refused = func in REFUSED
+        if refused:
+            raise NotImplementedError(
+                f"PyTorch's derivatives of {func.__name__}, called like this, are wrong under "
+                "torch.vmap: use vectorize=1, or a layer of torch.nn without padding_idx and "
+                "scale_grad_by_freq"
+            )
+        return func(*args, **kwargs)
+
+
+def normalize_then_scale(function: Callable, *args: Any, **kwargs: Any) -> Tensor:
+    """One of `NORMALIZATIONS`, its weight and bias applied outside it: so it has no such error."""
+    options = signature(function).bind(*args, **kwargs).arguments
+    weight, bias = options.pop("weight", None), options.pop("bias", None)
+    x = function(**options)  # layer_norm: (..., *weight.shape); the others: (B, channels, ...)
+    if function is not F.layer_norm:
+        per_channel = (-1, *[1] * (x.dim() - 2))
+        weight = None if weight is None else weight.view(per_channel)  # (channels, 1, ...)
+        bias = None if bias is None else bias.view(per_channel)
+    x = x if weight is None else x * weight
+    return x if bias is None else x + bias
