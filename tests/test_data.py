@@ -230,9 +230,16 @@ def test_a_file_has_the_mode_that_open_gives(tmp_path, umask):
     assert modes["written.txt"] == modes["opened.txt"] == 0o666 & ~umask
 
 
-def test_a_temporary_file_keeps_the_suffix_that_some_writers_go_by(tmp_path):
-    data.write_atomically(tmp_path / "a.npz", lambda path: np.savez(path, x=np.arange(3)))
-    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
+def test_a_temporary_file_keeps_its_suffix_and_is_on_the_same_disk(tmp_path):
+    """numpy and matplotlib go by the suffix; between disks nothing can be renamed."""
+    folders = []
+
+    def write(temporary):
+        folders.append(temporary.parent.parent)
+        np.savez(temporary, x=np.arange(3))  # appends .npz where it is missing
+
+    data.write_atomically(tmp_path / "a.npz", write)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"] and folders == [tmp_path]
 
 
 UNSAVABLE = [
