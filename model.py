@@ -113,11 +113,11 @@ class PolicyConfig:
         most = H - To + 1
         if Ta > most:
             raise ValueError(f"n_action_steps {Ta}: horizon {H} has {most} after observation {To}")
-        halvings = len(self.unet_widths) - 1
-        if H % 2**halvings:
+        levels = len(self.unet_widths)
+        if H % 2 ** (levels - 1):
             raise ValueError(
-                f"horizon {H} cannot be halved {halvings} times, as between the "
-                f"{halvings + 1} levels of unet_widths: use a multiple of {2**halvings}"
+                f"horizon {H} is no multiple of {2 ** (levels - 1)}: it is halved between the "
+                f"{levels} levels of unet_widths"
             )
         if self.diffusion_steps % self.inference_steps:
             raise ValueError(
