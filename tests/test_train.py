@@ -1,8 +1,10 @@
 """Tests of train.py: Algorithm 1's batches and steps, whole runs at preset `tiny`, bad input."""
 
 import contextlib
+import copy
 import functools
 import json
+import math
 import os
 import re
 import shutil
@@ -28,6 +30,7 @@ from conftest import (
     whole_state,
 )
 from test_finetune import own_recording
+from torch.func import functional_call
 
 import data
 import evaluate
@@ -142,6 +145,154 @@ def test_a_share_of_the_batches_sees_no_instruction_and_of_inner_steps_nothing(r
         for name in one:
             zero = hides and name not in train.PER_WINDOW
             assert torch.equal(other[name], torch.zeros_like(one[name]) if zero else one[name])
+
+
+# ---- Algorithm 1, whole steps --------------------------------------------------------------------
+
+
+def two_tasks():
+    """The windows and instruction features of two tasks unlike each other.
+
+    The robot moves twice as far in the second task, and its clouds lie 2 m aside.
+    """
+    samplers = {}
+    for i, task in enumerate(("stir", "pour")):
+        recording = own_recording(180, ends=[90, 180], task=task) | {"meta": {}}
+        recording["points"] += np.float16(2 * i)
+        recording["action"] *= 1 + i
+        demonstrations = data.Demonstrations(**recording)
+        samplers[task] = data.WindowSampler(demonstrations, model.PRESETS["tiny"])
+    generator = torch.Generator().manual_seed(0)
+    text = {task: torch.randn(512, generator=generator).double() for task in samplers}
+    return samplers, text
+
+
+def plain_meta_training(policy, samplers, text, settings):
+    """Algorithm 1 with SGD's inner step, AdamW and the moving average written out.
+
+    Yields after each outer step (weights, averaged weights, query loss, query loss before the inner
+    step, gradient norm). Draws are as train.py says: they follow from (seed, step, task) alone.
+    """
+    theta = {name: p.detach().clone() for name, p in policy.named_parameters()}
+    m, v, average = ({name: torch.zeros_like(p) for name, p in theta.items()} for _ in range(3))
+    n = settings.support + settings.query
+    for step in range(settings.steps):
+        theta = {name: p.requires_grad_() for name, p in theta.items()}
+        after, before = [], []
+        for i, (task, sampler) in enumerate(samplers.items()):
+            seed = np.random.SeedSequence((settings.seed, step, i)).generate_state(2, np.uint64)[0]
+            generator = torch.Generator().manual_seed(int(seed))
+            batch = sampler.batch(n, generator) | policy.draw_noise_and_timesteps(n, generator)
+            task_inputs = {name: batch.pop(name) for name in list(batch) if "demo_" in name}
+            task_inputs["text"] = text[task][None]
+            support = {name: x[: settings.support] for name, x in batch.items()} | task_inputs
+            query = {name: x[settings.support :] for name, x in batch.items()} | task_inputs
+            loss = functional_call(policy, theta, (), support)
+            gradient = torch.autograd.grad(loss, list(theta.values()), create_graph=True)
+            adapted = {
+                name: p - settings.inner_lr * g for (name, p), g in zip(theta.items(), gradient)
+            }
+            after.append(functional_call(policy, adapted, (), query))
+            before.append(functional_call(policy, theta, (), query))
+        loss = torch.stack(after).mean()
+        gradients = dict(zip(theta, torch.autograd.grad(loss, list(theta.values()))))
+
+        warm = (step + 1) / settings.warmup
+        done = (step - settings.warmup) / (settings.steps - settings.warmup)
+        rate = settings.lr * (warm if warm <= 1 else (1 + math.cos(math.pi * done)) / 2)
+        decay = 0 if step == 0 else 1 - (1 + step) ** -0.75
+        theta = {name: p.detach() for name, p in theta.items()}
+        for name, g in gradients.items():  # AdamW, betas 0.95 and 0.999, weight decay 1e-6
+            m[name] = 0.95 * m[name] + 0.05 * g
+            v[name] = 0.999 * v[name] + 0.001 * g**2
+            unbiased_m = m[name] / (1 - 0.95 ** (step + 1))
+            unbiased_v = v[name] / (1 - 0.999 ** (step + 1))
+            shrunk = theta[name] * (1 - rate * 1e-6)
+            theta[name] = shrunk - rate * unbiased_m / (unbiased_v.sqrt() + 1e-8)
+            average[name] = decay * average[name] + (1 - decay) * theta[name]
+        norm = torch.cat([g.flatten() for g in gradients.values()]).norm()
+        yield theta, average, loss.item(), torch.stack(before).mean().item(), norm.item()
+
+
+def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_written_out():
+    samplers, text = two_tasks()
+    settings = train.Settings(
+        seed=3, steps=4, support=2, query=3, inner_lr=0.05, lr=1e-2, warmup=2, vectorize=2
+    )
+    device = torch.device("cpu")
+    policy, average, optimizer = train.initialize(model.PRESETS["tiny"], settings, samplers, device)
+    policy.double(), average.module.double()  # in place: the optimizer's parameters, too
+    for part in ("points", "state", "action"):  # scaled to both tasks
+        whole = torch.cat([getattr(sampler, part).flatten(0, -2) for sampler in samplers.values()])
+        scaled = policy.normalizer.normalize(part, whole)
+        for end in (scaled.amin(0), scaled.amax(0).neg()):
+            assert torch.allclose(end, torch.full_like(end, -1))
+    plain = plain_meta_training(copy.deepcopy(policy), samplers, text, settings)
+    training = train.meta_train(policy, average, optimizer, samplers, text, settings)
+    for k, (theta, averaged, loss, before, norm), (step, figures) in zip(range(4), plain, training):
+        assert step == k + 1 and figures["loss"] == pytest.approx(loss, rel=1e-9)
+        assert figures["loss_before"] == pytest.approx(before, rel=1e-9)
+        assert figures["gradient_norm"] == pytest.approx(norm, rel=1e-9)
+        for name, parameter in policy.named_parameters():
+            assert torch.allclose(parameter, theta[name], atol=1e-9), (step, name)
+        for name, parameter in average.module.named_parameters():
+            assert torch.allclose(parameter, averaged[name], atol=1e-9), (step, name)
+    assert k == 3 and list(training) == []
+
+
+@pytest.fixture
+def own_pair(monkeypatch):
+    """A folder with two tasks' recordings of random numbers, whose positions are known."""
+    monkeypatch.setattr(report, "draw_curves", lambda folder: None)  # a second each
+    Path("own").mkdir()
+    for task, reach in (("stir", 2.0), ("pour", 1.0)):
+        recording = own_recording(180, ends=[90, 180], task=task)
+        recording["state"] *= reach
+        recording["meta"] = json.dumps({"positions_in_state": 3, "success_frames": [40, 40]})
+        np.savez(f"own/{task}.npz", **recording)
+    return Path("own")
+
+
+def first_step(folder, options=""):
+    """Trains one step on own recordings; the line of metrics.jsonl and the EMA checkpoint."""
+    argv = "--preset tiny --steps 1 --clip-weights random --device cpu --data".split()
+    out = Path("runs") / (options or "plain")
+    train.main([*argv, str(folder), "--out", str(out), *options.split()])
+    return metrics(out)[0], weights(out / "ema-00001.pt")[0]
+
+
+FLAGS = "--augment|--after-success 3|--seed 1|--inner-lr 0.5|--lr 1|--support 5|--query 9"
+FLAGS += "|--instruction-dropout 1|--support-only 1|--maml off|--maml off --bfloat16"
+
+
+def test_every_flag_changes_the_training(own_pair):
+    """The first step's numbers are others with it; twice without it, they are the same."""
+    runs = {
+        options: first_step(own_pair, options) for options in ["", "--seed 0", *FLAGS.split("|")]
+    }
+    figures = {
+        name: (line["loss"], line["gradient_norm"], line["lr"]) for name, (line, _) in runs.items()
+    }
+    assert figures[""] == figures["--seed 0"]
+    assert len(set(figures.values())) == len(runs) - 1
+    exact, rounded = (figures[name][0] for name in ("--maml off", "--maml off --bfloat16"))
+    assert rounded == pytest.approx(exact, rel=0.05)
+
+
+def test_the_seed_draws_the_weights_and_all_tasks_scale_the_normalizer(own_pair):
+    _, initial = first_step(own_pair, "--lr 0")
+    _, again = first_step(own_pair, "--lr 0 --seed 0 --support 5")
+    _, others = first_step(own_pair, "--lr 0 --seed 1")
+    assert same_bits(dict(initial), dict(again))
+    drawn = [name for name in initial if "normalizer" not in name and initial[name].std() > 0]
+    assert len(drawn) > 20 and not any(torch.equal(initial[n], others[n]) for n in drawn)
+    pair = [data.load_demonstrations(file) for file in own_pair.glob("*.npz")]
+    for part in ("points", "state", "action"):
+        whole = np.concatenate(
+            [getattr(d, part).reshape(-1, getattr(d, part).shape[-1]) for d in pair]
+        )
+        half = (whole.max(0) - whole.min(0)) / 2
+        assert np.allclose(initial[f"normalizer.{part}_scale"], half, rtol=1e-3)
 
 
 # ---- Whole runs ----------------------------------------------------------------------------------
