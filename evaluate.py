@@ -20,7 +20,6 @@ import argparse
 import json
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
@@ -29,6 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import data
 import scripts
 from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
 from model import DAMIPolicy
@@ -195,16 +195,9 @@ def hold_out(
     """
     kept, held = {}, {}
     for task, whole in recorded.items():
-        if n and n >= len(whole):
-            raise ValueError(f"{task} has {len(whole)} episodes: use a --held-out below that")
-        kept[task] = whole.take(len(whole) - n)
-        if n:
-            start, meta = len(kept[task].points), dict(whole.meta)
-            if "success_frames" in meta:
-                meta["success_frames"] = meta["success_frames"][len(kept[task]) : len(whole)]
-            parts = {part: getattr(whole, part)[start:] for part in ("points", "state", "action")}
-            ends = whole.episode_ends[-n:] - start
-            held[task] = replace(whole, **parts, episode_ends=ends, meta=meta)
+        kept[task], heldout = data.hold_out(whole, n)
+        if heldout is not None:
+            held[task] = heldout
     return kept, held
 
 
@@ -302,7 +295,7 @@ def rollout_job(
     device = policy.normalizer.action_scale.device
     if loaded["task"] != task:
         demonstrations = load_demonstrations(data).take(n_demonstrations)
-        sampler = WindowSampler(demonstrations, policy.config, device)
+        sampler = WindowSampler(demonstrations, policy.config, device=device)
         loaded.update(task=task, sampler=sampler, envs=[])
     while len(loaded["envs"]) < len(seeds):
         loaded["envs"].append(MetaWorldPointCloudEnv(task, policy.config.num_points))
@@ -585,7 +578,7 @@ def main(argv: list[str] | None = None) -> None:
             file.unlink()
 
         if args.gif:
-            sampler = WindowSampler(recorded[tasks[0]], policy.config, device)
+            sampler = WindowSampler(recorded[tasks[0]], policy.config, device=device)
             success = write_gif(policy, sampler, text[tasks[0]], args.seed, args.gif)
             print(f"{tasks[0]}: {'success' if success else 'failure'}; wrote {args.gif}")
             return

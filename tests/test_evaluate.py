@@ -316,7 +316,7 @@ def test_your_own_simulator_is_rolled_out_in(monkeypatch):
             observation = env.observe()
     points, state, action = (np.stack(x).astype(np.float32) for x in zip(*frames))
     recorded = data.Demonstrations("go", "Go there.", points, state, action, np.array(ends), {})
-    assert recorded.problem() is None
+    assert recorded.check() is None
     goals = points[points[..., 0] > 0.12]  # not the hand where it begins, but the marker
     assert len(goals) and np.abs(goals[:, 2] - 0.1).max() < 0.15
 
@@ -447,11 +447,11 @@ def test_the_last_episodes_are_held_out():
     recorded = numbered([30, 20, 40, 25], frames=[1, 2, 3, 4]).take(3)
     kept, held = evaluate.hold_out({"stir": recorded}, 2)
     assert kept["stir"].episode_ends.tolist() == [30] and len(kept["stir"].action) == 30
-    assert held["stir"].episode_ends.tolist() == [20, 60] and held["stir"].problem() is None
+    assert held["stir"].episode_ends.tolist() == [20, 60] and held["stir"].check() is None
     assert held["stir"].meta["success_frames"] == [2, 3]
     np.testing.assert_array_equal(held["stir"].action, recorded.action[30:90])
     assert evaluate.hold_out({"stir": recorded}, 0)[1] == {}
-    with pytest.raises(ValueError, match="stir has 3 episodes: use a --held-out below that"):
+    with pytest.raises(ValueError, match="stir has 3 episodes: hold out fewer than that"):
         evaluate.hold_out({"stir": recorded}, 3)
 
 
