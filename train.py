@@ -430,8 +430,8 @@ def fingerprint(samplers: dict[str, WindowSampler]) -> str:
     sha = hashlib.sha256()
     for sampler in samplers.values():
         sha.update(f"{sampler.task} {sampler.instruction}".encode())
-        if sampler.positions:  # scenes are moved about
-            sha.update(f"{sampler.positions} {sampler.center.tolist()}".encode())
+        if sampler.augment:
+            sha.update(f"{sampler.positions_in_state} {sampler.center.tolist()}".encode())
         for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
             sha.update(part.cpu().numpy().tobytes())
     return sha.hexdigest()
