@@ -382,6 +382,55 @@ def test_a_demonstration_that_is_left_out_of_a_rollout_is_all_zeros(monkeypatch)
         assert torch.equal(left_out[part], torch.zeros_like(x))
 
 
+class Corridor:
+    """A robot that goes one step ahead whatever it is told, and is there after `length` steps."""
+
+    def __init__(self, length):
+        self.length = length
+
+    def reset(self, *, seed):
+        self.steps = 0
+        return self.observe(), {}
+
+    def advance(self, action):
+        self.steps += 1
+        return 0.0, False, {"success": self.steps >= self.length}
+
+    def observe(self):
+        state = np.full(9, self.steps, np.float32)
+        state[0] = self.length  # tells the rollout
+        return {"point_cloud": np.ones((64, 3), np.float32), "agent_pos": state}
+
+
+@pytest.mark.parametrize("lengths", [[40] * 6, [40, 36, 40, 44, 40, 44]])
+def test_each_rollout_holds_a_demonstration_of_its_own_from_beginning_to_end(monkeypatch, lengths):
+    policy, read = model.DAMIPolicy(model.PRESETS["tiny"]), {}
+
+    def encode(text, demo_points, demo_state, demo_action):
+        episode = (demo_action[:, :1, 0] / 10).round()  # (1, 1), see `numbered`
+        return demo_action, episode
+
+    def sample(points, state, context, generator):
+        assert len(context[1]) == len(state)
+        for length, episode in zip(state[:, -1, 0], context[1][:, 0]):
+            read.setdefault(int(length), []).append(int(episode))
+        torch.randn(len(state), generator=generator)
+        return torch.zeros(len(state), 8, 4)
+
+    monkeypatch.setattr(policy, "encode_demo", encode)
+    monkeypatch.setattr(policy, "sample_actions", sample)
+    sampler = data.WindowSampler(numbered(lengths), policy.config)
+    long = [30, 5, 24, 17, 39]  # steps of each rollout: some end before others
+    envs, generator = [Corridor(n) for n in long], torch.Generator().manual_seed(3)
+    successes = evaluate.rollout(policy, envs, range(5), sampler, torch.zeros(512), generator)
+    assert successes == [True] * 5
+
+    again = torch.Generator().manual_seed(3)  # all are drawn before any noise
+    drawn = [sampler.draw_episode(again) for _ in long]
+    assert len(set(drawn)) >= 3  # the seed is such that they differ
+    assert read == {n: [episode] * -(-n // 8) for n, episode in zip(long, drawn)}
+
+
 # ---- Bad input -----------------------------------------------------------------------------------
 
 
