@@ -1,0 +1,498 @@
+"""What every script does the same way. Nothing here is part of the method: skip it when reading.
+
+Settings become flags; a user's mistake ends in one line and exit code 2; a folder belongs to one
+run; Ctrl-C lets the step at hand finish; work is shared among processes. No function here knows
+what a policy, a task or the folder of a run is, and nothing of the project is imported.
+"""
+
+import argparse
+import difflib
+import errno
+import json
+import math
+import multiprocessing
+import os
+import platform
+import shlex
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import field, fields, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import filelock
+import torch
+from torch.utils._pytree import tree_leaves, tree_map
+from tqdm import tqdm
+
+
+class UserError(Exception):
+    """A mistake made at the command line. Its message is one line that says what to do instead."""
+
+
+# ---- Settings: a frozen dataclass whose fields are flags -----------------------------------------
+
+
+def setting(default: Any, help: str, **bounds: Any) -> Any:
+    """A dataclass field with its default, its line of help, and bounds: least, most, choices."""
+    return field(default=default, metadata={"help": help, **bounds})
+
+
+def flag_name(name: str) -> str:
+    """The flag of a field: `inner_lr` -> `--inner-lr`."""
+    return "--" + name.replace("_", "-")
+
+
+def check_settings(settings: Any) -> None:
+    """Raises UserError if a number of a settings dataclass is outside its bounds, or not finite."""
+    for f in fields(settings):
+        value = getattr(settings, f.name)
+        if not isinstance(value, (int, float)):
+            continue
+        least, most = f.metadata.get("least", -math.inf), f.metadata.get("most", math.inf)
+        if not math.isfinite(value):
+            raise UserError(f"{flag_name(f.name)} is {value}: use a finite number")
+        if value < least:
+            raise UserError(f"{flag_name(f.name)} is {value}: use at least {least}")
+        if value > most:
+            raise UserError(f"{flag_name(f.name)} is {value}: use at most {most}")
+
+
+def add_settings(parser: Any, settings_class: type, presets: dict[str, Any] | None = None) -> None:
+    """Adds a flag for each field of a settings dataclass; a flag that is not given is None.
+
+    Args:
+        parser: a parser of argparse, or a group of one.
+        settings_class: its fields are made by `setting`.
+        presets: name -> settings; the help of a flag then tells the value in each preset.
+    """
+    for f in fields(settings_class):
+        values = {name: getattr(preset, f.name) for name, preset in (presets or {}).items()}
+        help = f.metadata["help"] + describe_presets(values)
+        kind = next((t for t in get_args(f.type) if t is not type(None)), f.type)  # int | None
+        if kind is bool:
+            parser.add_argument(flag_name(f.name), action=argparse.BooleanOptionalAction, help=help)
+        else:
+            choices = f.metadata.get("choices")
+            parser.add_argument(flag_name(f.name), type=kind, choices=choices, help=help)
+
+
+def describe_presets(values: dict[str, Any]) -> str:
+    """` (paper 20, small 4, tiny 4)`, or ` (20)` where all presets have the same value."""
+    if not values:
+        return ""
+    if len(set(values.values())) == 1:
+        return f" ({next(iter(values.values()))})"
+    return f" ({', '.join(f'{preset} {value}' for preset, value in values.items())})"
+
+
+def with_flags(settings: Any, args: argparse.Namespace) -> Any:
+    """Returns the settings with what was given on the command line in place of their own values."""
+    given = {f.name: getattr(args, f.name) for f in fields(settings)}
+    return replace(settings, **{name: x for name, x in given.items() if x is not None})
+
+
+def add_common_flags(parser: Any) -> None:
+    """Adds the flags that training, adaptation and evaluation share."""
+    parser.add_argument("--device", help="cpu, cuda, cuda:1 ... (default: cuda if there is one)")
+    parser.add_argument(
+        "--workers", type=int, help="processes for collecting and evaluating (default: one a core)"
+    )
+    parser.add_argument(
+        "--threads", type=int, help="of PyTorch; 1 beside busy processes (default: one a core)"
+    )
+    parser.add_argument(
+        "--clip-weights",
+        help="CLIP's ViT-B-32.pt, or `random` (default: those of the checkpoint, or a download)",
+    )
+
+
+def choose(name: str, names: Iterable[str], what: str) -> str:
+    """Returns `name` if it is one of `names`; otherwise UserError with the nearest right one."""
+    names = sorted(names)
+    if name in names:
+        return name
+    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.4)
+    advice = f"did you mean {near[0]!r}?" if near else f"choose one of: {', '.join(names)}"
+    raise UserError(f"unknown {what} {name!r}: {advice}")
+
+
+# ---- Command lines -------------------------------------------------------------------------------
+
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def command_line(main: Callable[[], None], errors: tuple[type[Exception], ...] = ()) -> None:
+    """Runs a script's `main` and turns what a user can cause into one line on stderr.
+
+    UserError and `errors` (of files that are damaged or foreign), a full disk and too little
+    memory end in exit code 2; Ctrl-C, SIGTERM and a closed terminal in 130. Every other exception
+    is a mistake in the code and keeps its traceback; `python -X dev` shows all tracebacks.
+    """
+    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+        if signal.getsignal(number) == signal.SIG_DFL:  # `nohup` has SIGHUP ignored
+            signal.signal(number, signal.default_int_handler)
+    try:
+        main()
+        return
+    except KeyboardInterrupt as interrupt:
+        line, code = f"interrupted: {interrupt}".removesuffix(": "), 130
+    except Exception as error:
+        line, code = describe_user_error(error, errors), 2
+        if line is None or sys.flags.dev_mode:
+            raise
+    with suppress(OSError):  # the terminal may be gone
+        print(line, file=sys.stderr)
+    sys.exit(code)
+
+
+def describe_user_error(error: Exception, errors: tuple[type[Exception], ...]) -> str | None:
+    """The line for an error that is meant for a user; None for a mistake in the code."""
+    if isinstance(error, (UserError, *errors)):
+        return f"error: {' '.join(str(error).split())}"
+    if isinstance(error, OSError) and error.errno in FULL_DISK:
+        return f"error: {error.filename or 'a file'} was not written, {error.strerror}: make room"
+    out_of_memory = isinstance(error, (MemoryError, torch.OutOfMemoryError))
+    if out_of_memory or "can't allocate memory" in str(error):  # a RuntimeError on a CPU
+        return "error: out of memory: use a smaller --preset, or fewer windows, tasks or workers"
+    return None
+
+
+def pick_device(name: str | None, threads: int | None = None) -> torch.device:
+    """The device of that name; without a name `cuda` where there is one, else `cpu`.
+
+    `threads` is how many PyTorch uses on the CPU. They wait for each other, so one of them whose
+    core is busy with another process delays all. Rounding depends on their number. Raises
+    UserError for a device that cannot be used here.
+    """
+    if threads is not None:
+        if threads < 1:
+            raise UserError(f"--threads is {threads}: use at least 1")
+        torch.set_num_threads(threads)
+    name = name or ("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).split("\n")[0]
+        raise UserError(
+            f"--device {name} cannot be used here ({reason}): use --device cpu"
+        ) from error
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")  # TF32, as PyTorch has convolutions anyway
+        torch.cuda.set_device(device.index or 0)  # for streams and graphs
+    return device
+
+
+def hardware(device: str | torch.device = "cpu") -> str:
+    """The name of the processor that results are measured on, and how many cores it has."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_name(device)
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    except OSError:
+        models = []
+    name = models[0] if models else platform.processor() or platform.machine()
+    return f"{name}, {os.cpu_count()} cores"
+
+
+def provenance(script: str, argv: Sequence[str] | None, device: str | torch.device) -> dict:
+    """What stands beside every number: the hardware, the date, and the command that made it."""
+    arguments = sys.argv[1:] if argv is None else argv
+    return {
+        "hardware": hardware(device),
+        "date": time.strftime("%Y-%m-%d"),
+        "command": shlex.join(["python", script, *arguments]),
+    }
+
+
+# ---- Tables, bars, lines of JSON -----------------------------------------------------------------
+
+
+def format_table(rows: Sequence[Sequence[Any]]) -> str:
+    """A Markdown table, the first row its head, whose columns are aligned in a terminal too."""
+    cells = [[str(cell) for cell in row] for row in rows]
+    widths = [max(len(cell) for cell in column) for column in zip(*cells)]
+    cells.insert(1, ["-" * width for width in widths])
+    padded = [[cell.ljust(width) for cell, width in zip(row, widths)] for row in cells]
+    return "\n".join(f"| {' | '.join(row)} |" for row in padded)
+
+
+def print_settings(used: dict[str, Any], default: dict[str, Any]) -> None:
+    """Prints a table of what a run is made of, and of the default where that is different."""
+    rows = [["setting", "value", "default"]]
+    for name, value in used.items():
+        usual = default.get(name, value)
+        other = "" if usual is None or usual == value else format_value(usual)
+        rows.append([name, format_value(value), other])
+    print(format_table(rows), flush=True)
+
+
+def format_value(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+class StandardError:
+    """stderr for a progress bar. Ctrl-C also ends the `tee` of `2>&1 | tee log`: no error."""
+
+    def write(self, text: str) -> None:
+        with suppress(OSError, ValueError):
+            sys.stderr.write(text)
+
+    def flush(self) -> None:
+        with suppress(OSError, ValueError):
+            sys.stderr.flush()
+
+    def fileno(self) -> int:  # tqdm asks for the width of the terminal
+        return sys.stderr.fileno()
+
+
+def progress_bar(**options: Any) -> tqdm:
+    """A progress bar on stderr, as wide as the terminal; `options` are those of tqdm."""
+    return tqdm(file=StandardError(), dynamic_ncols=True, **options)
+
+
+def append_json(path: Path, **values: Any) -> None:
+    """Appends one line of JSON to a file."""
+    with path.open("a") as file:
+        file.write(json.dumps(values) + "\n")
+
+
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """The lines of such a file, without one that a killed process did not finish."""
+    if not path.exists():
+        return []
+    lines = []
+    for text in path.read_text(errors="replace").splitlines():
+        with suppress(ValueError):
+            lines.append(json.loads(text))
+    return [line for line in lines if isinstance(line, dict)]
+
+
+# ---- Folders and signals -------------------------------------------------------------------------
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Makes a folder that no other process may run in; UserError if one does.
+
+    The operating system frees the lock when this process ends, however that comes about.
+    """
+    lock = filelock.FileLock(folder / ".lock")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        raise UserError(f"another process runs in {folder}: use another --out") from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise UserError(f"{folder} cannot be written to ({reason}): use another --out") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+class StopRequest:
+    """Turns Ctrl-C, SIGTERM and a closed terminal into a request to stop after the step at hand.
+
+        with StopRequest() as stop:
+            for step in steps:
+                ...
+                if stop.requested:
+                    save()
+                    raise KeyboardInterrupt("saved")
+
+    A second one stops at once. Inside `stop.suspended()` the first one does, too.
+    """
+
+    NUMBERS = (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))
+
+    def __init__(self) -> None:
+        self.requested = False
+        self.previous: dict[int, Any] = {}
+
+    def __enter__(self) -> "StopRequest":
+        for number in self.NUMBERS:
+            if signal.getsignal(number) != signal.SIG_IGN:  # `nohup` has SIGHUP ignored
+                self.previous[number] = signal.signal(number, self.handle)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        for number, handler in self.previous.items():
+            signal.signal(number, handler)
+
+    def handle(self, *_: Any) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+    @contextmanager
+    def suspended(self) -> Iterator[None]:
+        """For long work that has nothing to save: the handlers are those of before."""
+        self.__exit__()
+        try:
+            yield
+        finally:
+            self.__enter__()
+
+
+# ---- Worker processes ----------------------------------------------------------------------------
+
+# In a worker process: where `report_progress` puts what it is told, and what `run_job` calls first.
+worker: dict[str, Any] = {"progress": None, "setup": None}
+
+
+def run_jobs(
+    job: Callable[..., Any],
+    jobs: Sequence[dict[str, Any]],
+    *,
+    workers: int | None,
+    total: int,
+    description: str,
+    setup: Callable[[], None] | None = None,
+) -> list:
+    """Calls `job(**arguments)` for each dictionary of arguments, in several processes.
+
+    Args:
+        job: a function of a module; it may call `report_progress`.
+        jobs: the keyword arguments of each call.
+        workers: processes; None: one a core.
+        total, description: what the progress bar counts to, and what it is called.
+        setup: called once in each process before its first job; a function of a module, or a
+            `functools.partial` of one.
+
+    Returns:
+        What the calls returned, in the order of `jobs`.
+
+    Raises:
+        UserError: `workers` is below 1, or a worker process was killed or could not start.
+        Exception: what a job raised. The other jobs are ended by then, and no process is left.
+    """
+    if workers is not None and workers < 1:
+        raise UserError(f"--workers is {workers}: use at least 1")
+    if not jobs:
+        return []
+    context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
+    others = set(multiprocessing.active_children())
+    with ignored_signals():  # processes inherit that: a terminal sends Ctrl-C to them, too
+        progress = context.SimpleQueue()
+        count = min(workers or os.cpu_count() or 1, len(jobs))
+        pool = ProcessPoolExecutor(count, context, start_worker, (progress, setup))
+        futures = [pool.submit(run_job, job, arguments) for arguments in jobs]
+    started = False
+    try:
+        with progress_bar(total=total, desc=description, unit="episode") as bar:
+            pending = set(futures)
+            while pending:
+                done, pending = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
+                while not progress.empty():
+                    text, amount = progress.get()
+                    started = True
+                    bar.set_postfix_str(text)
+                    bar.update(amount)
+                for future in done:
+                    future.result()  # raises what the job raised
+        return [future.result() for future in futures]
+    except BrokenProcessPool:
+        if started:
+            problem = "a worker process was killed, perhaps for memory: try fewer --workers"
+        else:
+            problem = (
+                "worker processes could not start: a script that collects or evaluates must do so "
+                'under `if __name__ == "__main__":`, since each process imports it once more'
+            )
+        raise UserError(problem) from None
+    finally:
+        with ignored_signals():
+            if not all(future.done() and not future.exception() for future in futures):
+                for process in set(multiprocessing.active_children()) - others:
+                    process.kill()
+            pool.shutdown(cancel_futures=True)  # waits for the processes
+
+
+@contextmanager
+def ignored_signals() -> Iterator[None]:
+    """Ignores Ctrl-C, SIGTERM and a closed terminal, also in the processes that are started inside.
+
+    Only the main thread can set handlers, and only the main thread is interrupted.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = {number: signal.signal(number, signal.SIG_IGN) for number in StopRequest.NUMBERS}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def start_worker(progress: Any, setup: Callable[[], None] | None) -> None:
+    """Prepares a worker process, which ends as soon as the one that started it is gone."""
+
+    def end_with_parent() -> None:
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    torch.set_num_threads(1)  # the other cores have processes of their own
+    worker.update(progress=progress, setup=setup)
+    report_progress("", 0)  # the process has started
+
+
+def run_job(job: Callable[..., Any], arguments: dict[str, Any]) -> Any:
+    # `setup` is not called in `start_worker`: an exception there would break the whole pool.
+    if worker["setup"] is not None:
+        worker["setup"]()
+        worker["setup"] = None
+    return job(**arguments)
+
+
+def report_progress(text: str, amount: int) -> None:
+    """Moves the progress bar of the process that runs the jobs; elsewhere it does nothing."""
+    if worker["progress"] is not None:
+        worker["progress"].put((text, amount))
+
+
+# ---- CUDA ----------------------------------------------------------------------------------------
+
+
+class CUDAGraphed:
+    """A function of tensors as one CUDA graph: it is launched at once and not kernel by kernel.
+
+    The first call records the graph on copies of its inputs. Every call copies its inputs over
+    those, so they must have the same shapes, and replays the graph. Whatever else the function
+    reads, such as weights, must stay at its place in memory. What it returns is overwritten by the
+    next call.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+        self.inputs: Any = None
+
+    def __call__(self, *inputs: Any) -> Any:
+        if self.inputs is None:
+            self.record(inputs)
+        torch._foreach_copy_(tree_leaves(self.inputs), tree_leaves(inputs))
+        self.graph.replay()
+        return self.outputs
+
+    def record(self, inputs: Any) -> None:
+        self.inputs = tree_map(torch.clone, inputs)
+        self.graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            self.function(*self.inputs)  # libraries prepare themselves at their first call
+        torch.cuda.current_stream().wait_stream(stream)
+        with torch.cuda.graph(self.graph):
+            self.outputs = self.function(*self.inputs)
