@@ -326,8 +326,11 @@ def plot_demonstration(
 
 
 def drawn_space(places: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The corners (3,), (3,) of the box that arrays (..., 3) fill; each side at least a tenth of
-    the longest one, and of 0.1 mm, so that a plane or a single point can be drawn, too."""
+    """The corners (3,) and (3,) of the box that arrays (..., 3) fill.
+
+    Each side is at least a tenth of the longest one, and at least 0.1 mm long, so that a plane and
+    a single point can be drawn, too.
+    """
     everything = np.concatenate([x.reshape(-1, 3) for x in places])
     low, high = everything.min(axis=0), everything.max(axis=0)
     longest = max((high - low).max(), 1e-3)
