@@ -73,7 +73,8 @@ def rollout(
     Returns:
         E booleans.
     """
-    To, device = policy.config.n_obs_steps, text.device
+    To = policy.config.n_obs_steps
+    device = text.device
 
     # Each rollout holds one reference demonstration. All are drawn before any noise is, and they
     # are encoded one at a time, since they may differ in length.
@@ -100,10 +101,10 @@ def rollout(
         state = np.stack([[o["agent_pos"] for o in observations[e]] for e in running])
         chunks = sample_chunks(
             policy,
-            torch.from_numpy(points).to(device),  # (E, To, N, P)
-            torch.from_numpy(state).to(device),  # (E, To, S)
-            [contexts[e] for e in running],
-            generator,
+            points=torch.from_numpy(points).to(device),  # (E, To, N, P)
+            state=torch.from_numpy(state).to(device),  # (E, To, S)
+            contexts=[contexts[e] for e in running],
+            generator=generator,
         )  # (E, Ta, A)
 
         for e, chunk in zip(list(running), chunks):
@@ -349,11 +350,11 @@ def rollout_job(
 
     success = rollout(
         policy,
-        worker_state["environments"][: len(seeds)],
-        seeds,
-        worker_state["sampler"],
-        torch.from_numpy(text).to(device),
-        torch.Generator().manual_seed(seeds[0]),
+        environments=worker_state["environments"][: len(seeds)],
+        seeds=seeds,
+        sampler=worker_state["sampler"],
+        text=torch.from_numpy(text).to(device),
+        generator=torch.Generator().manual_seed(seeds[0]),
         zero_demonstration=zero_demonstration,
     )
     report_progress(task, len(seeds))
@@ -387,7 +388,8 @@ def action_error(
     Returns:
         The error, and the error of always doing the mean action of `train_sampler`.
     """
-    generator, device = torch.Generator().manual_seed(seed), text.device
+    generator = torch.Generator().manual_seed(seed)
+    device = text.device
     To, Ta = policy.config.n_obs_steps, policy.config.n_action_steps
     mean_action = train_sampler.action.mean(dim=0)  # (A,)
     errors, errors_of_mean = [], []
@@ -493,8 +495,14 @@ def write_animation(
         environment = FilmedEnvironment(
             simulator.make(sampler.task, policy.config.num_points), on_step=progress.update
         )
-        generator = torch.Generator().manual_seed(episode_seed)
-        [success] = rollout(policy, [environment], [episode_seed], sampler, text, generator)
+        [success] = rollout(
+            policy,
+            environments=[environment],
+            seeds=[episode_seed],
+            sampler=sampler,
+            text=text,
+            generator=torch.Generator().manual_seed(episode_seed),
+        )
     environment.film()  # how it ended
     title = f"{sampler.task}: {'success' if success else 'failure'}"
     animate(environment.frames, title, writer, path)
@@ -529,9 +537,9 @@ def animate(frames: Sequence[Frame], title: str, writer: Any, path: str | Path) 
 
     shown = [*frames, *[frames[-1]] * 10]
     animation = FuncAnimation(figure, show, frames=shown)
-    with progress_bar(desc="drawing", unit="frame", total=len(shown)) as progress:
 
-        def save(temporary: Path) -> None:
+    def save(temporary: Path) -> None:
+        with progress_bar(desc="drawing", unit="frame", total=len(shown)) as progress:
             animation.save(
                 temporary,
                 writer=writer,
@@ -539,7 +547,7 @@ def animate(frames: Sequence[Frame], title: str, writer: Any, path: str | Path) 
                 progress_callback=lambda index, total: progress.update(),
             )
 
-        write_atomically(path, save)
+    write_atomically(path, save)
 
 
 def movie_writer(path: str | Path) -> Any:
@@ -570,11 +578,9 @@ def movie_writer(path: str | Path) -> Any:
 # ---- Folders of results --------------------------------------------------------------------------
 
 # What evaluate.py and finetune.py leave in their folder.
-RESULTS = (
-    *("success.json", "success.md", "success.png"),
-    *("adapted.pt", "adapted-[0-9]*.pt", "held-out.md"),
-    *("config.json", "metrics.jsonl", "events.out.tfevents.*"),
-)
+RESULTS = ["success.json", "success.md", "success.png", "held-out.md"]
+RESULTS += ["adapted.pt", "adapted-[0-9]*.pt"]
+RESULTS += ["config.json", "metrics.jsonl", "events.out.tfevents.*"]
 
 
 def claim_results(folder: Path, overwrite: bool) -> list[Path]:
@@ -619,7 +625,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Measures success in a simulator.")
     add = parser.add_argument
     add("--checkpoint", nargs="+", help="files or run folders (default: the newest run's last)")
-    add("--suite", help="ml10 or ml45 (default: the checkpoint's, or ml10)")
+    add("--suite", help="such as ml10, ml45 (default: the checkpoint's, or ml10)")
     add("--split", choices=("base", "novel", "all"), default="base", help="which of its tasks")
     add("--task", nargs="+", help="only these tasks, of any suite")
     add("--data", default="data", help="folder of the demonstrations (default: data)")
@@ -650,9 +656,9 @@ def check_flags(args: argparse.Namespace) -> None:
     ):
         if value < least:
             raise UserError(f"--{name} is {value}: use at least {least}")
-    evaluation_seed(args.seed, args.episodes - 1)
+    evaluation_seed(args.seed, args.episodes - 1)  # refuses what is out of range
     if args.gif:
-        movie_writer(args.gif)
+        movie_writer(args.gif)  # refuses what cannot be written
         if args.known_goals or "demonstration" in args.without:
             raise UserError("--gif: leave out --known-goals, and --without demonstration")
     if args.swap and args.top:
@@ -715,10 +721,11 @@ def check_together(checkpoints: Sequence[Checkpoint], tasks: Sequence[str]) -> N
     """Raises UserError for checkpoints that cannot be measured alike on these tasks."""
     first = checkpoints[0].info
     for checkpoint in checkpoints:
-        info, path = checkpoint.info, checkpoint.path
+        info = checkpoint.info
+        path = checkpoint.path
         if info["text_weights"] != first["text_weights"]:
             raise UserError(f"{path} was made with text weights {info['text_weights']!r}")
-        if info.get("adapted_to") not in (None, *tasks) or ("adapted_to" in info and tasks[1:]):
+        if "adapted_to" in info and list(tasks) != [info["adapted_to"]]:
             raise UserError(f"{path} was adapted to {info['adapted_to']}: measure it alone")
         if reads_instruction(info) != reads_instruction(first):
             raise UserError(f"{path}: with --no-instruction or without, not both at once")
@@ -727,10 +734,14 @@ def check_together(checkpoints: Sequence[Checkpoint], tasks: Sequence[str]) -> N
 def group_tasks(tasks: Sequence[str], simulator: Simulator, suite: str) -> Parts:
     """The means to report: of base and of novel tasks where there are both, else of all tasks."""
     base, novel = simulator.tasks(suite)
-    base, novel = [t for t in tasks if t in base], [t for t in tasks if t in novel]
-    if base and novel and len(base) + len(novel) == len(tasks):
-        return {"mean of base": base, "mean of novel": novel}
-    return {"mean": list(tasks)}
+    parts = {
+        "mean of base": [task for task in tasks if task in base],
+        "mean of novel": [task for task in tasks if task in novel],
+    }
+    others = [task for task in tasks if task not in base and task not in novel]
+    if others or not all(parts.values()):
+        return {"mean": list(tasks)}
+    return parts
 
 
 @dataclass(frozen=True)
@@ -846,7 +857,8 @@ def measure(
     device: torch.device,
 ) -> None:
     """Rolls out the checkpoints of all runs, and writes and prints the report."""
-    out, info = Path(args.out), runs[0][-1].info
+    out = Path(args.out)
+    info = runs[0][-1].info
     old_results = claim_results(out, args.overwrite)
     recordings, text, identity = load_inputs(args, simulator, tasks, info, device)
     for file in old_results:
@@ -855,10 +867,10 @@ def measure(
     successes = {}
     for measurement in choose_measurements(runs, recordings, text, args.swap):
         successes[measurement.label] = evaluate_checkpoint(
-            measurement.checkpoint,
-            simulator,
-            measurement.recordings,
-            measurement.text,
+            checkpoint=measurement.checkpoint,
+            simulator=simulator,
+            recordings=measurement.recordings,
+            text=measurement.text,
             episodes=args.episodes,
             seed=args.seed,
             workers=args.workers,
@@ -876,7 +888,7 @@ def measure(
         "episodes a task": args.episodes,
         "seed": args.seed,
         "goals": "of the demonstrations, each once" if args.known_goals else "new",
-        "without": " and ".join(args.without) or "nothing",
+        "left out": " and ".join(args.without) or "nothing",
         "text weights": identity,
         **common.provenance("evaluate.py", argv, device),
         **inference_overrides(args),
@@ -917,10 +929,17 @@ def main(argv: list[str] | None = None) -> None:
     if args.gif:
         if len(tasks) > 1:
             raise UserError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
-        watch(args, runs[0][-1], simulator, suite, tasks[0], device)
-    else:
-        with common.locked(Path(args.out)):
-            measure(args, argv, runs, simulator, suite, tasks, device)
+        watch(
+            args,
+            checkpoint=runs[0][-1],
+            simulator=simulator,
+            suite=suite,
+            task=tasks[0],
+            device=device,
+        )
+        return
+    with common.locked(Path(args.out)):
+        measure(args, argv, runs=runs, simulator=simulator, suite=suite, tasks=tasks, device=device)
 
 
 if __name__ == "__main__":

@@ -232,7 +232,7 @@ def test_ten_episodes_are_rolled_out_side_by_side(run, recordings, monkeypatch):
     """Part of the protocol of every published number: the noise drawn depends on it."""
     calls = []
 
-    def count(policy, environments, seeds, sampler, text, generator, zero_demonstration):
+    def count(policy, *, environments, seeds, generator, **_):
         calls.append((len(environments), list(seeds), generator.initial_seed()))
         return [True] * len(seeds)
 
@@ -286,11 +286,11 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
 def test_known_goals_are_those_of_the_demonstrations(run, recordings, monkeypatch):
     seeds = []
 
-    def collect_seeds(policy, environments, given, *_, **__):
-        seeds.extend(given)
-        return [True] * len(given)
+    def keep_seeds(policy, **options):
+        seeds.extend(options["seeds"])
+        return [True] * len(options["seeds"])
 
-    monkeypatch.setattr(evaluate, "rollout", collect_seeds)
+    monkeypatch.setattr(evaluate, "rollout", keep_seeds)
     text = {"left": torch.zeros(512)}
     known = data.load_demonstrations(recordings["left"]).meta["episode_seeds"]
     for options, expected in (
@@ -440,7 +440,7 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
     provenance = written["provenance"]
     assert provenance["title"] == "toy, base tasks" and provenance["episodes a task"] == 5
     assert provenance["seed"] == 3 and provenance["text weights"] == "words"
-    assert provenance["goals"] == "new" and provenance["without"] == "nothing"
+    assert provenance["goals"] == "new" and provenance["left out"] == "nothing"
     assert provenance["command"].startswith("python evaluate.py --checkpoint runs/toy-tiny")
     assert {"hardware", "date", "mean, last checkpoint"} <= set(provenance)
     assert "sampler" not in provenance
@@ -450,7 +450,7 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
 
 
 def test_the_best_checkpoints_of_a_run_are_averaged(run, recordings, monkeypatch, capsys):
-    def measured(checkpoint, simulator, recordings, *_, **__):
+    def measured(checkpoint, recordings, **_):
         return {task: [checkpoint.stem == "ema-00003", True] for task in recordings}
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
@@ -466,7 +466,7 @@ def test_the_best_checkpoints_of_a_run_are_averaged(run, recordings, monkeypatch
 def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordings, monkeypatch):
     calls = []
 
-    def measured(checkpoint, simulator, recordings, text, **options):
+    def measured(checkpoint, recordings, text, **options):
         read = {task: path.stem for task, path in recordings.items()}
         calls.append((read, text, options))
         return {task: [len(calls) == 1] * options["episodes"] for task in recordings}
@@ -495,7 +495,7 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordi
     assert options["zero_demonstration"] and options["config_overrides"] == {"n_action_steps": 4}
     assert not any(feature.any() for feature in text.values())
     provenance = report_of("without")["provenance"]
-    assert provenance["without"] == "demonstration and instruction"
+    assert provenance["left out"] == "demonstration and instruction"
     assert provenance["n_action_steps"] == 4 and "sampler" not in provenance
 
 
@@ -516,7 +516,7 @@ def test_a_run_of_another_policy_stands_beside_that_policys_published_numbers(
     monkeypatch.setattr(
         evaluate,
         "evaluate_checkpoint",
-        lambda checkpoint, simulator, recordings, *_, **__: {t: [True] for t in recordings},
+        lambda recordings, **_: {task: [True] for task in recordings},
     )
     renamed = dict(zip(("reach", "push"), recordings.values()))
     monkeypatch.setattr(evaluate, "collect", lambda *_, **__: renamed)
