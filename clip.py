@@ -5,8 +5,8 @@
 Source: Radford et al. 2021, "Learning Transferable Visual Models From Natural Language
 Supervision". Modules and tensors carry the names of OpenAI's checkpoint. The tower is never
 trained, so it may use PyTorch's own attention. The official `ViT-B-32.pt` is looked for in the
-cache, then downloaded; where neither works, seeded random weights take its place, which is said in
-every checkpoint and result.
+cache, then downloaded. Where neither works, seeded random weights take its place, and every
+checkpoint and result says so.
 
 The file imports nothing from the project and can be copied out alone, with
 `assets/bpe_simple_vocab_16e6.txt.gz`.
@@ -20,6 +20,7 @@ import html
 import http.client
 import math
 import os
+import tempfile
 import urllib.request
 import warnings
 import zipfile
@@ -38,6 +39,11 @@ from tqdm import tqdm
 CLIP_MERGES = Path(__file__).parent / "assets" / "bpe_simple_vocab_16e6.txt.gz"
 CLIP_SHA256 = "40d365715913c9da98579312b702a82c18be219cc2a73407c4526f58eba950af"
 CLIP_URL = f"https://openaipublic.azureedge.net/clip/models/{CLIP_SHA256}/ViT-B-32.pt"
+
+
+class TextWeightsError(ValueError):
+    """A file of CLIP's weights is damaged or foreign, or not the one a checkpoint was made with."""
+
 
 # ---- Tokenizer -----------------------------------------------------------------------------------
 
@@ -58,10 +64,16 @@ def clip_vocabulary() -> tuple[dict[int, str], dict[tuple[str, str], int], dict[
     with gzip.open(CLIP_MERGES, "rt", encoding="utf-8") as file:
         lines = file.read().split("\n")[1:48895]  # the ones CLIP was trained with
     merges = [tuple(line.split()) for line in lines]
-    words = [*symbols.values(), *(s + "</w>" for s in symbols.values())]
-    words += [*(a + b for a, b in merges), START, END]
     ranks = {pair: rank for rank, pair in enumerate(merges)}
-    return symbols, ranks, {word: i for i, word in enumerate(words)}
+    vocabulary = [
+        *symbols.values(),
+        *(symbol + "</w>" for symbol in symbols.values()),  # at the end of a word
+        *(first + second for first, second in merges),
+        START,
+        END,
+    ]
+    ids = {symbol: i for i, symbol in enumerate(vocabulary)}
+    return symbols, ranks, ids
 
 
 @lru_cache(maxsize=65536)
@@ -99,8 +111,8 @@ def tokenize(texts: str | Sequence[str], context_length: int = 77) -> Tensor:
     for row, text in zip(tokens, texts):
         text = html.unescape(html.unescape(ftfy.fix_text(text))).lower()
         words = [i for word in WORD.findall(text) for i in tokenize_word(word)]
-        words = [ids[START], *words[: context_length - 2], ids[END]]
-        row[: len(words)] = torch.tensor(words)
+        sequence = [ids[START], *words[: context_length - 2], ids[END]]
+        row[: len(sequence)] = torch.tensor(sequence)
     return tokens  # (B, context_length)
 
 
@@ -122,13 +134,19 @@ class ResidualAttentionBlock(nn.Module):
         self.ln_1 = nn.LayerNorm(width)
         self.attn = nn.MultiheadAttention(width, heads, batch_first=True)
         self.ln_2 = nn.LayerNorm(width)
-        wide = {"c_fc": nn.Linear(width, 4 * width), "gelu": QuickGELU()}
-        self.mlp = nn.Sequential(OrderedDict(wide, c_proj=nn.Linear(4 * width, width)))
+        self.mlp = nn.Sequential(
+            OrderedDict(
+                c_fc=nn.Linear(width, 4 * width),
+                gelu=QuickGELU(),
+                c_proj=nn.Linear(4 * width, width),
+            )
+        )
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """x (B, T, width), mask (T, T), added to the scores -> (B, T, width)."""
         y = self.ln_1(x)
-        x = x + self.attn(y, y, y, need_weights=False, attn_mask=mask)[0]
+        attended, _ = self.attn(y, y, y, need_weights=False, attn_mask=mask)
+        x = x + attended
         return x + self.mlp(self.ln_2(x))
 
 
@@ -140,7 +158,7 @@ class CLIPTextEncoder(nn.Module):
         identity: says which weights these are; checkpoints and results carry it.
 
     Raises:
-        ValueError: a tensor is missing or has another shape.
+        TextWeightsError: a tensor is missing or has another shape.
     """
 
     def __init__(self, weights: dict[str, Tensor], identity: str):
@@ -157,12 +175,12 @@ class CLIPTextEncoder(nn.Module):
 
         for name, expected in self.state_dict().items():
             if name not in weights:
-                raise ValueError(
+                raise TextWeightsError(
                     f"CLIP weights {identity}: '{name}' is missing; give ViT-B-32's text tensors"
                 )
             found, shape = tuple(weights[name].shape), tuple(expected.shape)
             if found != shape:
-                raise ValueError(
+                raise TextWeightsError(
                     f"CLIP weights {identity}: '{name}' has shape {found}, ViT-B/32's is {shape}"
                 )
         state = {name: weights[name].float() for name in self.state_dict()}  # from float16
@@ -220,9 +238,12 @@ def random_clip_weights(seed: int) -> dict[str, Tensor]:
             "mlp.c_proj.weight": normal(residual, 512, 2048),
             "mlp.c_proj.bias": torch.zeros(512),
         }
-        weights |= {f"transformer.resblocks.{i}.{name}": x for name, x in block.items()}
-    weights |= {"ln_final.weight": torch.ones(512), "ln_final.bias": torch.zeros(512)}
-    return weights | {"text_projection": normal(512**-0.5, 512, 512)}
+        for name, tensor in block.items():
+            weights[f"transformer.resblocks.{i}.{name}"] = tensor
+    weights["ln_final.weight"] = torch.ones(512)
+    weights["ln_final.bias"] = torch.zeros(512)
+    weights["text_projection"] = normal(512**-0.5, 512, 512)
+    return weights
 
 
 def file_sha256(path: Path) -> str:
@@ -231,7 +252,7 @@ def file_sha256(path: Path) -> str:
 
 
 def read_official(path: Path) -> CLIPTextEncoder:
-    """The text tower of OpenAI's own file, a TorchScript archive, once its SHA-256 is checked."""
+    """The text tower of OpenAI's own file, a TorchScript archive; check its SHA-256 before."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # TorchScript is deprecated, OpenAI's file is what it is
         weights = torch.jit.load(str(path), map_location="cpu").state_dict()
@@ -241,10 +262,10 @@ def read_official(path: Path) -> CLIPTextEncoder:
 def read_clip_file(path: Path) -> CLIPTextEncoder:
     """The text tower of a file the user gave: OpenAI's own, or a plain state dict, never unpickled.
 
-    Raises ValueError for a file that is missing, cut off, or neither of the two.
+    Raises TextWeightsError for a file that is missing, cut off, or neither of the two.
     """
     if not path.is_file():
-        raise ValueError(f"{path}: there is no such file; give CLIP's ViT-B-32.pt")
+        raise TextWeightsError(f"{path}: there is no such file; give CLIP's ViT-B-32.pt")
     sha256 = file_sha256(path)
     if sha256 == CLIP_SHA256:
         return read_official(path)
@@ -253,10 +274,10 @@ def read_clip_file(path: Path) -> CLIPTextEncoder:
         like_zip = file.read(2) == b"PK"
     if like_zip and not zipfile.is_zipfile(path):  # a zip's table of contents stands at its end
         size = path.stat().st_size
-        raise ValueError(f"{path}: the file is cut off after {size} bytes; fetch it again")
+        raise TextWeightsError(f"{path}: the file is cut off after {size} bytes; fetch it again")
     names = zipfile.ZipFile(path).namelist() if like_zip else []
     if any(name.endswith("/constants.pkl") for name in names):
-        raise ValueError(
+        raise TextWeightsError(
             f"{path}: a TorchScript archive with SHA-256 {sha256[:8]}..., not the official "
             f"{CLIP_SHA256[:8]}...; fetch ViT-B-32.pt again, or give a plain state dict"
         )
@@ -264,38 +285,56 @@ def read_clip_file(path: Path) -> CLIPTextEncoder:
         weights = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file fails in a dozen ways
         reason = str(error).split("\n")[0]
-        raise ValueError(
+        raise TextWeightsError(
             f"{path}: neither CLIP's ViT-B-32.pt nor a plain state dict ({reason})"
         ) from None
     if not isinstance(weights, dict) or not all(isinstance(x, Tensor) for x in weights.values()):
-        raise ValueError(f"{path}: neither CLIP's ViT-B-32.pt nor a plain state dict")
+        raise TextWeightsError(f"{path}: neither CLIP's ViT-B-32.pt nor a plain state dict")
     return CLIPTextEncoder(weights, f"state-dict-{sha256[:8]}")
 
 
 def download_clip(path: Path) -> None:
-    """Fetches OpenAI's ViT-B-32.pt; it appears at `path` complete and checked, or not at all."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        with urllib.request.urlopen(CLIP_URL, timeout=5) as response:
-            size = int(response.headers.get("Content-Length", 0))
-            path.parent.mkdir(parents=True, exist_ok=True)
-            bar = tqdm(total=size, unit="B", unit_scale=True, desc=path.name)
-            with open(part, "wb") as file, bar:
+    """Fetches OpenAI's ViT-B-32.pt; it appears at `path` complete and checked, or not at all.
+
+    Raises OSError where the network or the disk fails, TextWeightsError for another file.
+    """
+    with urllib.request.urlopen(CLIP_URL, timeout=5) as response:
+        size = int(response.headers.get("Content-Length", 0))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
+            part = Path(folder) / path.name
+            progress = tqdm(total=size, unit="B", unit_scale=True, desc=path.name)
+            with open(part, "wb") as file, progress:
                 while chunk := response.read(1 << 20):
-                    bar.update(file.write(chunk))
-        if (got := part.stat().st_size) < size:
-            raise OSError(f"the connection ended after {got} of {size} bytes")
-        if file_sha256(part) != CLIP_SHA256:
-            raise ValueError(f"{CLIP_URL}: what arrived has another SHA-256 and was thrown away")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+                    progress.update(file.write(chunk))
+            if (received := part.stat().st_size) < size:
+                raise OSError(f"the connection ended after {received} of {size} bytes")
+            if file_sha256(part) != CLIP_SHA256:
+                raise TextWeightsError(
+                    f"{CLIP_URL}: what arrived has another SHA-256 and was thrown away"
+                )
+            os.replace(part, path)
+
+
+def cached_clip_file() -> Path:
+    """Where ViT-B-32.pt is kept once it is downloaded; OSError for a user without a home folder."""
+    if folder := os.environ.get("XDG_CACHE_HOME"):
+        return Path(folder) / "clip" / "ViT-B-32.pt"
+    try:
+        return Path.home() / ".cache" / "clip" / "ViT-B-32.pt"
+    except RuntimeError:  # HOME is not set, and the system does not know the user
+        raise OSError("there is no home folder to keep them in: set XDG_CACHE_HOME") from None
+
+
+def random_clip_text_encoder(seed: int) -> CLIPTextEncoder:
+    """A text tower with random weights, which its identity says."""
+    return CLIPTextEncoder(random_clip_weights(seed), f"random-seed-{seed}")
 
 
 def load_clip_text_encoder(
     weights: str | Path | None = None, seed: int = 0, download: bool = True
 ) -> CLIPTextEncoder:
-    """CLIP's text tower: from `weights`, else the cache, else downloaded, else random.
+    """Returns CLIP's text tower: from `weights`, else the cache, else downloaded, else random.
 
     Args:
         weights: OpenAI's ViT-B-32.pt, a plain state dict with its names, or "random".
@@ -307,30 +346,33 @@ def load_clip_text_encoder(
         "random-seed-<seed>".
 
     Raises:
-        ValueError: the file is missing, cut off, not the official archive, or lacks a tensor.
+        TextWeightsError: the file is missing, cut off, not the official archive, lacks a tensor.
     """
-    random = f"random-seed-{seed}"
     if weights == "random":
-        return CLIPTextEncoder(random_clip_weights(seed), random)
+        return random_clip_text_encoder(seed)
     if weights is not None:
         return read_clip_file(Path(weights))
 
-    path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clip" / "ViT-B-32.pt"
-    if not path.is_file():
-        try:
+    path = None
+    try:
+        path = cached_clip_file()
+        if not path.is_file():
             if not download:
                 raise OSError("downloading is off")
             download_clip(path)
-        except (OSError, http.client.HTTPException) as error:
-            warnings.warn(
-                f"No CLIP weights ({error}): text features come from random weights, seed {seed}. "
-                "They tell instructions apart but know no language. To use CLIP, put its "
-                f"ViT-B-32.pt at {path} or name it with --clip-weights.",
-                stacklevel=2,
-            )
-            return CLIPTextEncoder(random_clip_weights(seed), random)
+    except (OSError, http.client.HTTPException) as error:
+        advice = f"put its ViT-B-32.pt at {path} or name it" if path else "name its ViT-B-32.pt"
+        warnings.warn(
+            f"No CLIP weights ({error}): text features come from random weights, seed {seed}. "
+            "They tell instructions apart but know no language. To use CLIP, "
+            f"{advice} with --clip-weights.",
+            stacklevel=2,
+        )
+        return random_clip_text_encoder(seed)
     if file_sha256(path) != CLIP_SHA256:
-        raise ValueError(f"{path}: damaged, its SHA-256 is not that of ViT-B-32.pt; delete it")
+        raise TextWeightsError(
+            f"{path}: damaged, its SHA-256 is not that of ViT-B-32.pt; delete it"
+        )
     return read_official(path)
 
 
@@ -349,13 +391,13 @@ def text_features(
         (features (B, 512) float32 on the CPU, identity of the weights).
 
     Raises:
-        ValueError: the weights that can be had are not those of the checkpoint.
+        TextWeightsError: the weights that can be had are not those of the checkpoint.
     """
     if weights is None and identity is not None and identity.startswith("random"):
         weights = "random"
     encoder = load_clip_text_encoder(weights)
     if identity is not None and encoder.identity != identity:
-        raise ValueError(
+        raise TextWeightsError(
             f"the checkpoint was made with the text weights {identity!r}, here are "
             f"{encoder.identity!r}: give the same ones with --clip-weights"
         )

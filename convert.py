@@ -1,8 +1,8 @@
-"""What `python data.py` does with a recording: it draws one, or imports those of other projects.
+"""Draws a recording, or imports those of other projects.
 
-    python data.py --show data/reach.npz                                 # draws it to a PNG
-    python data.py --import stir.zarr --instruction "Stir the soup."     # a replay buffer of DP3
-    python data.py --import folder/of/dataset --camera camera.json       # a dataset of LeRobot
+    python convert.py --show data/reach.npz                                # draws it to a PNG
+    python convert.py --import stir.zarr --instruction "Stir the soup."    # a replay buffer of DP3
+    python convert.py --import folder/of/dataset --camera camera.json      # a dataset of LeRobot
 
 **DP3**: a zarr group (format 2 or 3, a folder or a zip) with data/point_cloud (F, N, 3 or more;
 colours are left out), data/state, data/action and meta/episode_ends. It does not name its task.
@@ -13,7 +13,7 @@ depth (H, W), uint16 millimetres or float metres. The format has no place for a 
 are a feature of that name, (4,) or (3, 3), or in the file of --camera, which comes first, see
 `CAMERA`. Videos are not read.
 
-Every task becomes a file of data.py. Who needs zarr or pyarrow installs it.
+Every task becomes a file as data.py describes it. Who needs zarr or pyarrow installs it.
 
 Letters: F frames, N points, H x W pixels, S state dim, A action dim, E episodes.
 """
@@ -28,9 +28,15 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from data import Demonstrations, farthest_point_sample, load_demonstrations, save_demonstrations
+from data import (
+    Demonstrations,
+    RecordingError,
+    farthest_point_sample,
+    load_demonstrations,
+    save_demonstrations,
+)
 from robot import CameraError, cloud, no_pose, unfit
-from scripts import at_least, draw_demonstration, progress_bar
+from scripts import at_least, command_line, draw_demonstration, progress_bar
 
 # What the JSON of --camera may hold. Without a pose points stay in the frame of the camera: right,
 # down, forward. The positions in a state must be in the frame of the points.
@@ -45,7 +51,7 @@ Recordings = dict[str, dict[str, np.ndarray]]  # instruction -> points, state, a
 
 
 def refuse(path: Any, what: str) -> NoReturn:
-    raise ValueError(f"{path}: {what}")
+    raise RecordingError(f"{path}: {what}")
 
 
 def package(name: str, path: Path) -> Any:
@@ -149,7 +155,7 @@ def read_lerobot(
 
 
 def choose_feature(path: Path, features: dict[str, Any], chosen: str | None) -> str:
-    """The cloud or depth to read; ValueError, with what there is, if that is not clear."""
+    """The cloud or depth to read; RecordingError, with what there is, if that is not clear."""
     arrays = {k: f for k, f in features.items() if f["dtype"] not in ("video", "image", "string")}
     square = [k for k, f in arrays.items() if sum(n > 1 for n in f["shape"]) == 2]
     clouds = [name for name in square if is_cloud(name)]
@@ -210,7 +216,7 @@ def read_tasks(path: Path, parquet: Any) -> dict[int, str]:
 
 
 def read_camera(path: Path) -> dict[str, Any]:
-    """What the file of --camera says; ValueError for what `CAMERA` does not have."""
+    """What the file of --camera says; RecordingError for what `CAMERA` does not have."""
     given = read_json(path)
     for name, value in given.items():
         if name not in CAMERA:
@@ -259,8 +265,10 @@ def import_recordings(args: argparse.Namespace) -> list[Path]:
         arrays |= {part: np.float32(arrays[part]) for part in ("state", "action")}
         meta = {"imported_from": path.name, "positions_in_state": args.positions_in_state}
         files[file] = Demonstrations(name, said, **arrays, meta=meta)
-        if problem := files[file].problem():
-            refuse(path, problem)
+        try:
+            files[file].check()
+        except RecordingError as error:
+            refuse(path, str(error))
     for file, demonstrations in files.items():
         save_demonstrations(file, demonstrations)
     return list(files)
@@ -299,6 +307,10 @@ def main(argv: list[str] | None = None) -> None:
     out = Path(args.out or args.show).with_suffix(".png")
     recorded = load_demonstrations(args.show)
     if not 0 <= args.episode < len(recorded):
-        raise ValueError(f"{args.show} holds episodes 0 to {len(recorded) - 1}, not {args.episode}")
+        refuse(args.show, f"holds episodes 0 to {len(recorded) - 1}, not {args.episode}")
     draw_demonstration(recorded, out, args.episode)
     print(f"wrote {out}")
+
+
+if __name__ == "__main__":
+    command_line(main)

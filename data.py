@@ -1,23 +1,24 @@
 """Demonstrations: their files, the windows that are trained on, and augmentation.
 
-    python data.py --show data/reach.npz        # draws a recording to a PNG; see convert.py
-
 Nothing here knows a simulator or a robot: simulator.py and robot.py record, and so may you. A file
-is checked when it is read, `WindowSampler` holds it as tensors, and its `batch` draws what
-`DAMIPolicy.loss` takes beside the instruction and noise. Nothing of the project is imported.
+is checked when it is written and when it is read. `WindowSampler` holds a recording as tensors, and
+its `batch` draws what `DAMIPolicy.loss` takes beside the instruction and the noise. Nothing of the
+project is imported.
 
-Letters: W windows, T demonstration frames, F stored frames, N points, E episodes, H = 16 horizon,
-To = 2 observation steps, Ta = 8 executed actions, A action dim, S state dim, M points to sample.
+Letters: W windows, T demonstration frames, F stored frames, N points, P numbers a point (x, y, z
+and features), E episodes, H = 16 horizon, To = 2 observation steps, Ta = 8 executed actions,
+A action dim, S state dim, M points of a cloud before sampling.
 """
 
 import json
 import math
 import os
 import re
+import tempfile
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from itertools import zip_longest
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,39 +27,67 @@ import numpy as np
 import torch
 from torch import Tensor
 
+
+class RecordingError(ValueError):
+    """A recording is damaged, inconsistent or foreign, or does not fit what is asked of it."""
+
+
 # ---- Point clouds --------------------------------------------------------------------------------
 
 
-def farthest_point_sample(points: np.ndarray, n: int) -> np.ndarray:
-    """Samples n of the points (M, 3) float32, each the farthest from all before it.
+def positions(points: Any) -> Any:
+    """Returns the positions (..., 3), metres, of points (..., 3 or more), an array or a tensor.
 
-    Returns (n, 3) float32 in the order of selection, so that the first k of the n are themselves
-    such a sample of k. The same cloud always gives the same sample. With M < n the sample is
-    repeated from its beginning. Raises ValueError for an empty cloud.
+    What stands behind the positions are features of the points, such as colours.
+    """
+    return points[..., :3]
+
+
+def farthest_point_sample(points: np.ndarray, n: int) -> np.ndarray:
+    """Samples n of the points (M, P) float32, each the farthest from all before it.
+
+    Distances are those of the positions; a point keeps its features. Returns (n, P) float32 in the
+    order of selection, so that the first k of the n are themselves such a sample of k. The same
+    cloud always gives the same sample. With M < n the sample is repeated from its beginning.
+    Raises ValueError for an empty cloud.
     """
     if len(points) == 0:
         raise ValueError("the cloud is empty: nothing was seen inside the workspace")
+    xyz = positions(points)  # (M, 3)
+    count = min(n, len(points))
     if len(points) < 8:  # too few for a tree of 2**3 buckets
-        order = fpsample.fps_sampling(points, min(n, len(points)), start_idx=0)
+        order = fpsample.fps_sampling(xyz, count, start_idx=0)
     else:
-        order = fpsample.bucket_fps_kdline_sampling(points, min(n, len(points)), h=3, start_idx=0)
-    return points[np.resize(order.astype(np.int64), n)]  # (n, 3)
+        order = fpsample.bucket_fps_kdline_sampling(xyz, count, h=3, start_idx=0)
+    return points[np.resize(order.astype(np.int64), n)]  # (n, P)
 
 
-# ---- Recordings and their files ------------------------------------------------------------------
+# ---- Recordings ----------------------------------------------------------------------------------
+
+NAME = r"\w[\w.-]{0,99}"  # of a task, and so of files and folders
+FLOATS = (np.float16, np.float32, np.float64)  # in this machine's byte order
 
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """Recorded episodes of one task, one after the other."""
+    """Recorded episodes of one task, one after the other.
+
+    `meta` says how they were made, in what JSON can hold. Four of its entries have a meaning here:
+
+    - positions_in_state: how many points of space, x y z each, a state begins with, where an action
+      begins with a change of the first. Scenes can be augmented only where this is known.
+    - success_frames: the frame of each episode's first success, counted from the episode's start.
+    - workspace: two opposite corners of the box that holds the points, metres.
+    - simulator: the name of the simulator that they were made in; own recordings have none.
+    """
 
     task: str
     instruction: str
-    points: np.ndarray  # (F, N, 3) float16, metres, in the order of farthest point sampling
+    points: np.ndarray  # (F, N, P) float16 in the order of farthest point sampling; metres first
     state: np.ndarray  # (F, S) float32
     action: np.ndarray  # (F, A) float32
     episode_ends: np.ndarray  # (E,) int64: one past the last frame of each episode
-    meta: dict  # how they were made; training reads success_frames and positions_in_state
+    meta: dict
 
     def __len__(self) -> int:
         return len(self.episode_ends)
@@ -69,84 +98,232 @@ class Demonstrations:
         return slice(ends[index], ends[index + 1])
 
     def take(self, n: int | None) -> "Demonstrations":
-        """The first n episodes (views, no copies); None: all."""
+        """Returns the first n episodes (views, no copies), or all for None.
+
+        Raises RecordingError where there are fewer.
+        """
         if n is None:
             return self
         if not 1 <= n <= len(self):
-            raise ValueError(f"{n} demonstrations of {self.task} asked for, there are {len(self)}")
+            raise RecordingError(
+                f"{n} demonstrations of {self.task} asked for, there are {len(self)}"
+            )
         end = self.episode(n - 1).stop
-        arrays = {name: getattr(self, name)[:end] for name in ("points", "state", "action")}
-        return replace(self, **arrays, episode_ends=self.episode_ends[:n])
+        return replace(
+            self,
+            points=self.points[:end],
+            state=self.state[:end],
+            action=self.action[:end],
+            episode_ends=self.episode_ends[:n],
+        )
 
-    def problem(self) -> str | None:
-        """What keeps these arrays from being trained on; None if nothing does."""
-        arrays = {part: getattr(self, part) for part in ("points", "state", "action")}
-        for part, array in arrays.items():
-            dims, kind = 3 if part == "points" else 2, array.dtype
-            if array.ndim != dims or kind.kind != "f" or not kind.isnative or 0 in array.shape[1:]:
-                return f"{part} must be {dims}-dimensional floats, not {kind} {array.shape}"
-        if self.points.shape[2] != 3:
-            return f"points must be (frames, points, 3), not {self.points.shape}"
-        ends = self.episode_ends
-        if ends.ndim != 1 or ends.dtype.kind not in "iu" or (np.diff(ends, prepend=0) <= 0).any():
-            return "episode_ends must be growing whole numbers, one past each episode's last frame"
-        if len(ends) == 0:
-            return "holds no episodes: record or collect it again"
-        lengths = {part: len(array) for part, array in arrays.items()} | {"episodes": int(ends[-1])}
-        if len(set(lengths.values())) > 1:
-            return f"lengths differ: {lengths}"
+    # -- Checks: each raises RecordingError for what could not be saved, read and trained on
 
+    def check(self) -> None:
+        """Raises RecordingError, in one line, for anything that keeps these from being used."""
+        self.check_text()
+        self.check_shapes()
+        self.check_lengths()
+        self.check_numbers()
+        self.check_points()
+        self.check_meta()
+
+    def check_text(self) -> None:
+        """Task and instruction are text, and files can be named by the task."""
+        for name in ("task", "instruction"):
+            value = getattr(self, name)
+            if not isinstance(value, str):
+                raise RecordingError(f"{name} must be text (str), not {type(value).__name__}")
         if not re.fullmatch(NAME, self.task):
-            return f"task {self.task[:100]!r} is no name of letters, digits, '-', '_' and '.'"
-        positions = self.meta.get("positions_in_state", 0)
-        if type(positions) is not int or not 0 <= 3 * positions <= self.state.shape[1]:
-            return f"positions_in_state is {positions!r}, a state has {self.state.shape[1]} numbers"
-        if positions and self.action.shape[1] < 3:
-            return "with positions_in_state an action must begin with a displacement"
-        try:
-            box = np.array(self.meta.get("workspace") or np.zeros((2, 3)), np.float64)
-        except (TypeError, ValueError):
-            box = np.zeros(0)
-        if box.shape != (2, 3) or not np.isfinite(box).all():
-            return "workspace must be two corners of three numbers, metres"
-        frames = self.meta.get("success_frames", [0] * len(ends))
-        listed = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
-        if not listed or len(frames) < len(ends):
-            return "success_frames must be a list with one whole number for each episode"
+            raise RecordingError(
+                f"task {self.task[:100]!r} is no name of letters, digits, '-', '_' and '.'"
+            )
 
-        for part, array in arrays.items():
-            if not (np.isfinite(array).all() and float(np.abs(array).max()) < 1e30):
-                return f"{part} holds NaN or infinite numbers: record it again, in metres"
-        if np.abs(self.points).max() > 100:
-            return "points reach beyond 100 metres: write them in metres"
-        return None
+    def check_shapes(self) -> None:
+        """The fields that are arrays have the number of dimensions and the dtypes they need."""
+        for name in ("points", "state", "action", "episode_ends"):
+            value = getattr(self, name)
+            if not isinstance(value, np.ndarray):
+                raise RecordingError(f"{name} must be a NumPy array, not {type(value).__name__}")
+        for name, dims in (("points", 3), ("state", 2), ("action", 2)):
+            array = getattr(self, name)
+            if array.ndim != dims or array.dtype not in FLOATS or 0 in array.shape[1:]:
+                raise RecordingError(
+                    f"{name} must be {dims}-dimensional floats, not {array.dtype} {array.shape}"
+                )
+        if self.points.shape[2] < 3:
+            raise RecordingError(
+                f"points must be (frames, points, 3 or more), not {self.points.shape}"
+            )
+        if self.episode_ends.ndim != 1 or self.episode_ends.dtype.kind not in "iu":
+            raise RecordingError(
+                "episode_ends must be growing whole numbers, not "
+                f"{self.episode_ends.dtype} {self.episode_ends.shape}"
+            )
+
+    def check_lengths(self) -> None:
+        """Episodes follow each other without a gap, and all arrays have their frames."""
+        ends = [0, *self.episode_ends.tolist()]
+        if len(ends) == 1:
+            raise RecordingError("holds no episodes: record or collect it again")
+        if any(end <= start for start, end in pairwise(ends)):
+            raise RecordingError(
+                "episode_ends must be growing whole numbers, one past each episode's last frame"
+            )
+        lengths = {name: len(getattr(self, name)) for name in ("points", "state", "action")}
+        lengths["episodes"] = ends[-1]
+        if len(set(lengths.values())) > 1:
+            raise RecordingError(f"lengths differ: {lengths}")
+
+    def check_numbers(self) -> None:
+        """All numbers are finite, and far from the largest of float32."""
+        for name in ("points", "state", "action"):
+            array = getattr(self, name)
+            if not np.isfinite(array).all() or float(np.abs(array).max()) >= 1e30:
+                raise RecordingError(
+                    f"{name} holds NaN or infinite numbers: record it again, in metres"
+                )
+
+    def check_points(self) -> None:
+        """Positions are metres, features are small, and something was seen in every frame."""
+        xyz = positions(self.points)  # (F, N, 3)
+        features = self.points[..., 3:]  # (F, N, P - 3)
+        if np.abs(xyz).max() > 100:
+            raise RecordingError("points reach beyond 100 metres: write them in metres")
+        if features.size and np.abs(features).max() > 1:
+            raise RecordingError(
+                f"features of points reach {np.abs(features).max():g}: only positions are scaled "
+                "in training, so write colours from 0 to 1, and no feature beyond -1 to 1"
+            )
+        empty = np.flatnonzero((xyz == 0).all(axis=(1, 2)))  # frames whose points are padding
+        if len(empty):
+            raise RecordingError(
+                f"all points of frame {empty[0]} are at 0, 0, 0, which is how an empty cloud is "
+                "padded: record it again, with something to be seen"
+            )
+
+    def check_meta(self) -> None:
+        """What `meta` says can be written as JSON, and its known entries make sense."""
+        if not isinstance(self.meta, dict):
+            raise RecordingError(f"meta must be a dict, not {type(self.meta).__name__}")
+        try:
+            json.dumps(self.meta)
+        except (TypeError, ValueError) as error:
+            raise RecordingError(
+                f"meta must hold what JSON can (of NumPy, write x.item() or x.tolist()): {error}"
+            ) from None
+        self.check_positions_in_state()
+        self.check_success_frames()
+        self.check_workspace()
+        if "simulator" in self.meta and not isinstance(self.meta["simulator"], str):
+            raise RecordingError(f"simulator must be a name, not {self.meta['simulator']!r}")
+
+    def check_positions_in_state(self) -> None:
+        count = self.meta.get("positions_in_state", 0)
+        state_dim = self.state.shape[1]
+        if type(count) is not int or not 0 <= 3 * count <= state_dim:
+            raise RecordingError(
+                f"positions_in_state is {count!r}, a state has {state_dim} numbers"
+            )
+        if count and self.action.shape[1] < 3:
+            raise RecordingError("with positions_in_state an action must begin with a displacement")
+
+    def check_success_frames(self) -> None:
+        if "success_frames" not in self.meta:
+            return
+        frames = self.meta["success_frames"]
+        if (
+            not isinstance(frames, list)
+            or len(frames) < len(self)  # of those that `take` left out there may be more
+            or any(type(frame) is not int or frame < 0 for frame in frames)
+        ):
+            raise RecordingError(
+                "success_frames must be a list with one whole number for each episode"
+            )
+
+    def check_workspace(self) -> None:
+        if self.meta.get("workspace") is None:
+            return
+        try:
+            corners = np.array(self.meta["workspace"], np.float64)
+        except (TypeError, ValueError):  # no numbers, or lists of different lengths
+            corners = np.zeros(0)
+        if corners.shape != (2, 3) or not np.isfinite(corners).all():
+            raise RecordingError("workspace must be two corners of three numbers, metres")
+
+
+def hold_out(
+    demonstrations: Demonstrations, n: int
+) -> tuple[Demonstrations, Demonstrations | None]:
+    """Splits a recording into all but its last n episodes, and those n (None for n = 0).
+
+    Raises RecordingError where nothing would be left to train on.
+    """
+    if n == 0:
+        return demonstrations, None
+    if not 0 < n < len(demonstrations):
+        raise RecordingError(
+            f"{demonstrations.task} has {len(demonstrations)} episodes: hold out fewer than that"
+        )
+    kept = demonstrations.take(len(demonstrations) - n)
+    start = len(kept.points)
+    meta = dict(demonstrations.meta)
+    if "success_frames" in meta:
+        meta["success_frames"] = meta["success_frames"][len(kept) : len(demonstrations)]
+    heldout = replace(
+        demonstrations,
+        points=demonstrations.points[start:],
+        state=demonstrations.state[start:],
+        action=demonstrations.action[start:],
+        episode_ends=demonstrations.episode_ends[-n:] - start,
+        meta=meta,
+    )
+    return kept, heldout
+
+
+# ---- Files ---------------------------------------------------------------------------------------
+
+FIELDS = [field.name for field in fields(Demonstrations)]
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
-    """Calls `write` with a temporary name beside `path`, then renames: whole, or the old file."""
+    """Writes a file whole or not at all.
+
+    `write` is called with a path of the same name in a new hidden folder beside `path`; then that
+    file takes the place of `path`. If `write` raises, the old file stays as it is. Only a process
+    that is killed leaves the hidden folder behind; no other process ever removes it.
+    """
     path = Path(path)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # with its suffix: some go by it
-    try:
+    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
+        temporary = Path(folder) / path.name
         write(temporary)
         os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
-PARTS = [part.name for part in fields(Demonstrations)]
-NAME = r"\w[\w.-]{0,99}"  # of a task, and so of files and folders
+def write_text(path: str | Path, text: str) -> None:
+    """Writes a text file, whole or not at all."""
+    write_atomically(path, lambda temporary: temporary.write_text(text))
 
 
 def save_demonstrations(path: str | Path, demonstrations: Demonstrations) -> None:
-    """Writes one task's demonstrations as an `.npz` file; ValueError if they have a problem."""
-    if problem := demonstrations.problem():
-        raise ValueError(f"{path}: {problem}")
-    arrays = {part: getattr(demonstrations, part) for part in PARTS}
-    arrays["meta"] = json.dumps(demonstrations.meta)
+    """Writes one task's demonstrations as an `.npz` file; its folder is made if it is missing.
+
+    Raises RecordingError for demonstrations that could not be read again and trained on.
+    """
+    check_file(path, demonstrations)
 
     def write(temporary: Path) -> None:
         with open(temporary, "wb") as file:
-            np.savez(file, **arrays)  # compressed: half the size, six times the loading time
+            np.savez(  # compressed it would take half the size and six times the loading time
+                file,
+                task=demonstrations.task,
+                instruction=demonstrations.instruction,
+                points=demonstrations.points,
+                state=demonstrations.state,
+                action=demonstrations.action,
+                episode_ends=demonstrations.episode_ends,
+                meta=json.dumps(demonstrations.meta),
+            )
 
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, write)
@@ -155,30 +332,60 @@ def save_demonstrations(path: str | Path, demonstrations: Demonstrations) -> Non
 def load_demonstrations(path: str | Path) -> Demonstrations:
     """Reads what `save_demonstrations`, or a recorder of your own, wrote.
 
-    Raises ValueError, one line: missing, damaged, inconsistent, not finite; OSError: unreadable.
+    Raises RecordingError, in one line, for a file that is missing, damaged, foreign or
+    inconsistent, and OSError for one that may not be read.
     """
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"{path} is missing: collect it with `python simulator.py`, or record it")
+        raise RecordingError(
+            f"{path} is missing: collect it with `python simulator.py`, or record it"
+        )
     with open(path, "rb") as file:
         if not zipfile.is_zipfile(file):
-            raise ValueError(f"{path} is truncated or no .npz file: record or collect it again")
+            raise RecordingError(f"{path} is truncated or no .npz file: record or collect it again")
     try:
         with np.load(path, allow_pickle=False) as file:
-            missing = [part for part in PARTS if part not in file.files]
-            arrays = {part: file[part] for part in PARTS if part not in missing}
-        meta = dict(json.loads(str(arrays.pop("meta", "{}"))))
+            arrays = {name: file[name] for name in FIELDS if name in file.files}
     except Exception as error:  # numpy and zipfile raise many types; each means it cannot be read
         reason = " ".join(str(error).split())
-        raise ValueError(f"{path} is damaged or no file of demonstrations: {reason}") from None
-    if missing:
-        raise ValueError(f"{path} is no file of demonstrations: it lacks {', '.join(missing)}")
+        raise RecordingError(f"{path} is damaged or no file of demonstrations: {reason}") from None
+    if missing := [name for name in FIELDS if name not in arrays]:
+        raise RecordingError(f"{path} is no file of demonstrations: it lacks {', '.join(missing)}")
 
-    task, instruction = str(arrays.pop("task")), str(arrays.pop("instruction"))
-    demonstrations = Demonstrations(task, instruction, **arrays, meta=meta)
-    if problem := demonstrations.problem():
-        raise ValueError(f"{path}: {problem}")
+    demonstrations = Demonstrations(
+        task=read_text(path, "task", arrays["task"]),
+        instruction=read_text(path, "instruction", arrays["instruction"]),
+        points=arrays["points"],
+        state=arrays["state"],
+        action=arrays["action"],
+        episode_ends=arrays["episode_ends"],
+        meta=read_json(path, "meta", arrays["meta"]),
+    )
+    check_file(path, demonstrations)
     return demonstrations
+
+
+def check_file(path: str | Path, demonstrations: Demonstrations) -> None:
+    """`Demonstrations.check`, whose message begins with the path of the file."""
+    try:
+        demonstrations.check()
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+
+
+def read_text(path: Path, name: str, array: np.ndarray) -> str:
+    """The text that an array of a file holds; RecordingError if it holds anything else."""
+    if array.shape != () or array.dtype.kind != "U":
+        raise RecordingError(f"{path}: {name} must be text (str), not {array.dtype} {array.shape}")
+    return array.item()
+
+
+def read_json(path: Path, name: str, array: np.ndarray) -> Any:
+    """The value that an array of a file holds as JSON text; RecordingError if it does not."""
+    try:
+        return json.loads(read_text(path, name, array))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise RecordingError(f"{path}: {name} is no JSON: {error}") from None
 
 
 # ---- Augmentation --------------------------------------------------------------------------------
@@ -188,21 +395,36 @@ TURN = math.radians(10)  # about the vertical, at most
 STRETCH = 0.1  # share of shear and stretch, at most
 
 
-def draw_affine_maps(n: int, middle: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def sample_affine_maps(n: int, center: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Draws n affine maps of space, x -> x A^T + b: a shear and stretch, a turn, a shift.
 
-    The turn is about the vertical through `middle` (1, 3). Returns A (n, 3, 3), b (n, 1, 3).
+    The turn is about the vertical through `center` (1, 3). Returns A (n, 3, 3) and b (n, 1, 3).
     """
 
     def symmetric(*shape: int) -> Tensor:
+        """Uniform numbers in [-1, 1), on the CPU."""
         return 2 * torch.rand(shape, generator=generator, device=generator.device).cpu() - 1
 
-    angle, zero, one = TURN * symmetric(n), torch.zeros(n), torch.ones(n)
+    angle = TURN * symmetric(n)
     cos, sin = angle.cos(), angle.sin()
+    zero, one = torch.zeros(n), torch.ones(n)
     turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1).view(n, 3, 3)
-    a = turn @ (torch.eye(3) + STRETCH * symmetric(n, 3, 3))
-    b = middle - middle @ a.mT + torch.tensor(SHIFT) * symmetric(n, 3)[:, None]
+    a = turn @ (torch.eye(3) + STRETCH * symmetric(n, 3, 3))  # (n, 3, 3)
+    b = center - center @ a.mT + torch.tensor(SHIFT) * symmetric(n, 3)[:, None]  # (n, 1, 3)
     return a, b
+
+
+def map_positions(x: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Applies n affine maps, A (n, 3, 3) and b (n, 1, 3), to n scenes' positions (n, ..., 3)."""
+    return (x.flatten(1, -2) @ a.mT + b).view(x.shape)
+
+
+def workspace_center(points: np.ndarray, workspace: Any) -> Tensor:
+    """The middle (1, 3) of a workspace's two corners; of the points' own box if that is None."""
+    if workspace is None:
+        xyz = positions(points)
+        workspace = [xyz.min((0, 1)).tolist(), xyz.max((0, 1)).tolist()]
+    return torch.tensor(workspace).float().mean(dim=0, keepdim=True)
 
 
 # ---- Windows -------------------------------------------------------------------------------------
@@ -214,144 +436,192 @@ class WindowSampler:
     A window may begin To - 1 frames before an episode and end Ta - 1 frames after it, the edge
     frames repeated: 193 windows in an episode of 200 frames. An episode too short for a window
     keeps one. The clouds are held once, as float16. All that is drawn is float32: n windows are
-    points (n, To, N, 3), state (n, To, S) and action (n, H, A), a demonstration is demo_points
-    (1, T, N, 3), demo_state (1, T, S) and demo_action (1, T, A).
+    points (n, To, N, P), state (n, To, S) and action (n, H, A), a demonstration is demo_points
+    (1, T, N, P), demo_state (1, T, S) and demo_action (1, T, A).
 
     Args:
         demonstrations: of one task.
         config: a `model.PolicyConfig`, or anything with its dimensions.
         device: where the tensors are held.
         after_success: how many frames after its episode's first success a window may begin, where
-            the recording tells that frame; None: any number.
-        augment: `batch` moves each scene by an affine map of its own, where the recording tells the
-            positions in a state. No other direction or rotation in it is turned.
+            the recording says which frame that is; None: any number.
+        augment: `batch` moves each scene by an affine map of its own, where the recording says
+            which numbers of a state are positions. No other direction or rotation in it is turned.
 
-    Raises ValueError for demonstrations that do not fit the policy: dimensions, points or length.
+    Raises RecordingError for demonstrations that do not fit the policy: dimensions, points, length.
     """
 
     def __init__(
         self,
         demonstrations: Demonstrations,
         config: Any,
+        *,
         device: str | torch.device = "cpu",
         after_success: int | None = None,
         augment: bool = False,
     ) -> None:
-        self.task, self.instruction = demonstrations.task, demonstrations.instruction
+        self.task = demonstrations.task
+        self.instruction = demonstrations.instruction
         self.config = config
         self.episodes = [demonstrations.episode(index) for index in range(len(demonstrations))]
-        self.check_fit(demonstrations)
+        self.check_dimensions(demonstrations)
+        self.check_demonstration_length()
 
-        points = demonstrations.points[:, : config.num_points]  # the first are a sample themselves
-        self.points = torch.tensor(points, dtype=torch.float16, device=device)  # (F, N, 3)
+        # The first points of a farthest point sample are such a sample themselves.
+        points = demonstrations.points[:, : config.num_points]
+        self.points = torch.tensor(points, dtype=torch.float16, device=device)  # (F, N, P)
         self.state = torch.tensor(demonstrations.state, dtype=torch.float32, device=device)
         self.action = torch.tensor(demonstrations.action, dtype=torch.float32, device=device)
 
-        meta = demonstrations.meta
-        self.positions = meta.get("positions_in_state", 0) if augment else 0
-        box = meta.get("workspace") or [points.min((0, 1)).tolist(), points.max((0, 1)).tolist()]
-        self.middle = torch.tensor(box).float().mean(dim=0, keepdim=True)  # (1, 3) turned about
-        self.limit = max(1.0, float(self.action[:, :3].abs().max()))  # of a displacement, its unit
+        # What augmentation has to know
+        self.positions_in_state = demonstrations.meta.get("positions_in_state", 0)
+        self.augment = augment and self.positions_in_state > 0
+        self.center = workspace_center(points, demonstrations.meta.get("workspace"))  # (1, 3)
+        self.max_displacement = max(1.0, float(self.action[:, :3].abs().max()))  # as recorded
 
-        successes = meta.get("success_frames", []) if after_success is not None else []
-        windows, counts = [], []
-        for episode, success in zip_longest(self.episodes, successes[: len(self.episodes)]):
-            earliest = episode.start - (config.n_obs_steps - 1)
-            latest = max(episode.stop - config.horizon + config.n_action_steps - 1, earliest)
-            if success is not None:
-                latest = min(latest, episode.start + success + after_success)
-            frames = torch.arange(earliest, latest + 1)[:, None] + torch.arange(config.horizon)
-            windows.append(frames.clamp(episode.start, episode.stop - 1))  # (windows, H)
-            counts.append(len(frames))
+        success_frames = demonstrations.meta.get("success_frames")
+        windows = []  # of each episode
+        for index, episode in enumerate(self.episodes):
+            last_start = None
+            if after_success is not None and success_frames is not None:
+                last_start = episode.start + success_frames[index] + after_success
+            windows.append(self.windows_of(episode, last_start))
+        counts = torch.tensor([len(frames) for frames in windows])
         self.windows = torch.cat(windows).to(device)  # (W, H) the frame of each action
-        self.episode_of = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))  # (W,)
+        self.episode_of = torch.arange(len(windows)).repeat_interleave(counts)  # (W,)
 
-    def check_fit(self, demonstrations: Demonstrations) -> None:
-        config, (_, N, _) = self.config, demonstrations.points.shape
-        found = (demonstrations.state.shape[1], demonstrations.action.shape[1], N)
-        known = (config.state_dim, config.action_dim, config.num_points)
-        if found[:2] != known[:2] or N < config.num_points:
-            what = f"state, action, points have {found} dimensions, the policy's have {known}"
-            raise ValueError(f"{self.task}: {what}: use recordings, and a checkpoint, that agree")
-        T = max(math.ceil((e.stop - e.start) / config.demo_stride) for e in self.episodes)
-        if config.demo_encoder != "none" and T > config.demo_positions:
-            what = f"a demonstration has {T} frames (every {config.demo_stride}th)"
-            most = f"the policy {config.demo_positions} positions"
-            raise ValueError(f"{self.task}: {what}, {most}: cut it, or train on such data")
+    def check_dimensions(self, demonstrations: Demonstrations) -> None:
+        """Raises RecordingError where the policy has other dimensions, or wants more points."""
+        config = self.config
+        _, num_points, point_dim = demonstrations.points.shape
+        for what, recorded, expected in (
+            ("numbers a state", demonstrations.state.shape[1], config.state_dim),
+            ("numbers an action", demonstrations.action.shape[1], config.action_dim),
+            ("numbers a point", point_dim, getattr(config, "point_dim", 3)),
+        ):
+            if recorded != expected:
+                raise RecordingError(
+                    f"{self.task} has {recorded} {what}, the policy {expected}: "
+                    "use recordings, and a checkpoint, that agree"
+                )
+        if num_points < config.num_points:
+            raise RecordingError(
+                f"{self.task} has {num_points} points a cloud, the policy {config.num_points}: "
+                "use recordings, and a checkpoint, that agree"
+            )
+
+    def check_demonstration_length(self) -> None:
+        """Raises RecordingError for an episode that is longer than the policy has positions for."""
+        if self.config.demo_encoder == "none":
+            return
+        stride = self.config.demo_stride
+        T = max(math.ceil((episode.stop - episode.start) / stride) for episode in self.episodes)
+        if T > self.config.demo_positions:
+            raise RecordingError(
+                f"{self.task}: a demonstration has {T} frames (every {stride}th), the policy "
+                f"{self.config.demo_positions} positions: cut it, or train on such data"
+            )
+
+    def windows_of(self, episode: slice, last_start: int | None) -> Tensor:
+        """Returns the frames of each window of an episode, (windows, H).
+
+        Where it is given, no window begins after the frame `last_start`.
+        """
+        config = self.config
+        first = episode.start - (config.n_obs_steps - 1)
+        last = episode.stop - config.horizon + (config.n_action_steps - 1)
+        last = max(last, first)  # a short episode keeps one
+        if last_start is not None:
+            last = min(last, last_start)
+        frames = torch.arange(first, last + 1)[:, None] + torch.arange(config.horizon)
+        return frames.clamp(episode.start, episode.stop - 1)
 
     def __len__(self) -> int:
         return len(self.windows)
 
-    def sample(self, n: int, generator: torch.Generator, without: int = -1) -> dict[str, Tensor]:
+    def sample(
+        self, n: int, generator: torch.Generator, exclude: int | None = None
+    ) -> dict[str, Tensor]:
         """Draws n different windows (with repetition only where there are fewer than n).
 
-        None is of the episode `without`, unless that is the only one.
+        None is of the episode `exclude`, unless that is the only one.
         """
-        others = (self.episode_of != without).nonzero()[:, 0]
-        W, how = len(others) or len(self), {"generator": generator, "device": generator.device}
-        chosen = torch.randperm(W, **how)[:n] if n <= W else torch.randint(W, (n,), **how)
-        return self.gather(others[chosen.cpu()] if len(others) else chosen)
+        candidates = torch.arange(len(self))
+        if exclude is not None and len(self.episodes) > 1:
+            candidates = candidates[self.episode_of != exclude]
+
+        W, device = len(candidates), generator.device
+        if n <= W:
+            chosen = torch.randperm(W, generator=generator, device=device)[:n]
+        else:
+            chosen = torch.randint(W, (n,), generator=generator, device=device)
+        return self.gather(candidates[chosen.cpu()])
 
     def gather(self, indices: Tensor) -> dict[str, Tensor]:
-        """The windows of these indices (n,)."""
+        """Returns the windows of these indices (n,)."""
         frames = self.windows[indices.to(self.windows.device)]  # (n, H)
         observed = frames[:, : self.config.n_obs_steps]  # (n, To)
         return {
-            "points": self.points[observed].float(),  # (n, To, N, 3)
+            "points": self.points[observed].float(),  # (n, To, N, P)
             "state": self.state[observed],  # (n, To, S)
             "action": self.action[frames],  # (n, H, A)
         }
 
-    def draw_episode(self, generator: torch.Generator) -> int:
+    def sample_episode(self, generator: torch.Generator) -> int:
+        """Draws the index of an episode."""
         n, device = len(self.episodes), generator.device
         return int(torch.randint(n, (1,), generator=generator, device=device))
 
     def demonstration(self, episode: int) -> dict[str, Tensor]:
-        """A complete episode, every demo_stride-th frame of it, as `encode_demo` takes it."""
+        """Returns every demo_stride-th frame of an episode, as `encode_demo` takes it."""
         whole = self.episodes[episode]
         frames = slice(whole.start, whole.stop, self.config.demo_stride)
         return {
-            "demo_points": self.points[None, frames].float(),
-            "demo_state": self.state[None, frames],
-            "demo_action": self.action[None, frames],
+            "demo_points": self.points[None, frames].float(),  # (1, T, N, P)
+            "demo_state": self.state[None, frames],  # (1, T, S)
+            "demo_action": self.action[None, frames],  # (1, T, A)
         }
 
     def batch(self, n: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draws a reference demonstration, and n windows of other episodes where there are any."""
-        reference = self.draw_episode(generator)
+        reference = self.sample_episode(generator)
         demo = self.demonstration(reference)
-        windows = self.sample(n, generator, without=reference)
-        if self.positions:
-            demo = self.augment(demo, generator, prefix="demo_")
-            windows = self.augment(windows, generator)
-        return windows | demo
+        windows = self.sample(n, generator, exclude=reference)
+        if self.augment:
+            demo["demo_points"], demo["demo_state"], demo["demo_action"] = self.move_scenes(
+                demo["demo_points"], demo["demo_state"], demo["demo_action"], generator
+            )
+            windows["points"], windows["state"], windows["action"] = self.move_scenes(
+                windows["points"], windows["state"], windows["action"], generator
+            )
+        return {**windows, **demo}
 
-    def augment(
-        self, scenes: dict[str, Tensor], generator: torch.Generator, prefix: str = ""
-    ) -> dict[str, Tensor]:
-        """Moves each scene by an affine map of its own.
+    def move_scenes(
+        self, points: Tensor, state: Tensor, action: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Moves each scene of n by an affine map of its own.
 
         Points and the positions in a state move together, and the displacement that an action
-        begins with turns and stretches with them: the scene stays one of the same task.
+        begins with turns and stretches with them: the scene stays one of the same task. Takes and
+        returns points (n, T, N, P), state (n, T, S) and action (n, T', A).
         """
-        names = [f"{prefix}{part}" for part in ("points", "state", "action")]
-        points, state, action = (scenes[name] for name in names)
-        a, b = draw_affine_maps(len(points), self.middle, generator)
+        a, b = sample_affine_maps(len(points), self.center, generator)
         a, b = a.to(points.device), b.to(points.device)
 
-        def place(x: Tensor) -> Tensor:
-            return (x.flatten(1, -2) @ a.mT + b).view_as(x)
+        moved_points = map_positions(positions(points), a, b)  # (n, T, N, 3)
+        points = torch.cat([moved_points, points[..., 3:]], dim=-1)  # features stay as they are
 
-        at = 3 * self.positions
-        positions = place(state[..., :at].unflatten(-1, (-1, 3))).flatten(-2)  # (n, T, at)
-        state = torch.cat([positions, state[..., at:]], dim=-1)
-        displacement = (action[..., :3] @ a.mT).clamp(-self.limit, self.limit)  # (n, T', 3)
+        size = 3 * self.positions_in_state
+        in_state = state[..., :size].unflatten(-1, (-1, 3))  # (n, T, positions, 3)
+        moved_in_state = map_positions(in_state, a, b).flatten(-2)  # (n, T, size)
+        state = torch.cat([moved_in_state, state[..., size:]], dim=-1)
+
+        limit = self.max_displacement
+        displacement = (action[..., :3] @ a.mT).clamp(-limit, limit)  # (n, T', 3)
         action = torch.cat([displacement, action[..., 3:]], dim=-1)
-        return dict(zip(names, (place(points), state, action)))
+        return points, state, action
+
+    draw_episode = sample_episode  # old name, until evaluate.py and robot.py are rewritten
 
 
-if __name__ == "__main__":
-    from convert import main  # neither is needed where this file is copied to
-    from scripts import command_line
-
-    command_line(main)
+draw_affine_maps = sample_affine_maps  # old name, until tests/test_train.py is rewritten

@@ -1027,7 +1027,7 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
     recording = data.load_demonstrations(args.data)
     if (task := info.get("adapted_to", recording.task)) != recording.task:
         raise ValueError(f"{args.checkpoint} was adapted to {task}, {args.data} is of another task")
-    sampler = data.WindowSampler(recording, config, args.device)
+    sampler = data.WindowSampler(recording, config, device=args.device)
     text, _ = text_features([recording.instruction], args.clip_weights, info["text_weights"])
     text = text * scripts.is_told(info)
     torch.set_num_threads(max(1, (os.cpu_count() or 1) - 1))  # a core is left to the servo stream

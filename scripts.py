@@ -43,7 +43,8 @@ from tqdm import tqdm
 
 from baselines import PRESETS, build_policy
 from clip import text_features
-from data import Demonstrations, WindowSampler, write_atomically
+from common import UserError  # until train.py, finetune.py and evaluate.py use common.command_line
+from data import Demonstrations, WindowSampler, write_atomically, write_text
 from model import CHOICES, DAMIPolicy, PolicyConfig
 
 try:
@@ -193,12 +194,12 @@ def command_line(main: Callable[[], None], *errors: type[Exception]) -> None:
         return main()
     except KeyboardInterrupt as interrupt:
         line, code = f"interrupted{f': {interrupt}' if str(interrupt) else ''}", 130
-    except (ValueError, OSError, *errors) as error:
+    except (ValueError, OSError, UserError, *errors) as error:
         if sys.flags.dev_mode:
             raise
         line, code = f"error: {' '.join(str(error).split())}", 2
         if isinstance(error, OSError) and error.filename and error.strerror:
-            path = re.sub(r"(^|/)\.\d+\.", r"\1", str(error.filename))  # of `write_atomically`
+            path = re.sub(r"/?\.unfinished-\w+", "", str(error.filename))  # of `write_atomically`
             line = f"error: {path}: {error.strerror.lower()}, name another file or folder"
     except (MemoryError, RuntimeError) as error:
         if sys.flags.dev_mode or "memory" not in f"{type(error)} {error}".lower():
@@ -283,9 +284,18 @@ def choose_config(
     return config
 
 
-def windows(recorded: dict[str, Demonstrations], *how: Any) -> dict[str, WindowSampler]:
-    """The windows of each task's recording; `how` as WindowSampler takes it."""
-    return {task: WindowSampler(d, *how) for task, d in recorded.items()}
+def windows(
+    recorded: dict[str, Demonstrations],
+    config: PolicyConfig,
+    device: str | torch.device = "cpu",
+    after_success: int | None = None,
+    augment: bool = False,
+) -> dict[str, WindowSampler]:
+    """The windows of each task's recording, as WindowSampler takes it."""
+    return {
+        task: WindowSampler(d, config, device=device, after_success=after_success, augment=augment)
+        for task, d in recorded.items()
+    }
 
 
 def is_told(info: dict[str, Any]) -> bool:
@@ -449,8 +459,8 @@ def digest(samplers: dict[str, WindowSampler]) -> str:
     sha = hashlib.sha256()
     for sampler in samplers.values():
         sha.update(f"{sampler.task} {sampler.instruction}".encode())
-        if sampler.positions:  # scenes are moved about
-            sha.update(f"{sampler.positions} {sampler.middle.tolist()}".encode())
+        if sampler.augment:  # scenes are moved about
+            sha.update(f"{sampler.positions_in_state} {sampler.center.tolist()}".encode())
         for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
             sha.update(part.cpu().numpy().tobytes())
     return sha.hexdigest()
@@ -560,11 +570,6 @@ def remove_temporaries(folder: Path) -> None:
             temporary.unlink(missing_ok=True)
         except PermissionError:
             pass  # another user's process, which lives
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file, atomically."""
-    write_atomically(path, lambda temporary: temporary.write_text(text))
 
 
 class Captured:

@@ -128,7 +128,7 @@ class Bench:
         torch.manual_seed(0)
         self.preset, self.settings = preset, SETTINGS[preset]
         self.policy = baselines.build_policy(config).to(device)
-        self.sampler: WindowSampler = WindowSampler(recorded, config, device)
+        self.sampler: WindowSampler = WindowSampler(recorded, config, device=device)
         self.policy.normalizer.fit(self.sampler.points, self.sampler.state, self.sampler.action)
         self.text = torch.randn(config.text_dim, generator=torch.Generator().manual_seed(0)).to(
             device
@@ -228,8 +228,15 @@ def inner_step_table(checkpoint: Path, folder: str, rate: float | None, seeds: i
     (base, novel), trained = suite_tasks("ml10"), info["arguments"]
     recorded = [load_demonstrations(path) for path in collect(base + novel, folder).values()]
     text, _ = text_features([d.instruction for d in recorded], None, info["text_weights"])
-    windows = trained["after_success"], trained["augment"]
-    samplers = [WindowSampler(d, policy.config, "cpu", *windows) for d in recorded]
+    samplers = [
+        WindowSampler(
+            demonstrations,
+            policy.config,
+            after_success=trained["after_success"],
+            augment=trained["augment"],
+        )
+        for demonstrations in recorded
+    ]
     params = {name: p.detach() for name, p in policy.named_parameters()}
     n = trained["support"] + trained["query"]
 

@@ -22,11 +22,11 @@ from torch.optim.swa_utils import AveragedModel
 
 import baselines
 import data
+import metaworld_env
 import scripts
-import simulator
 import train
+from metaworld_env import MetaWorldPointCloudEnv
 from scripts import command_line
-from simulator import MetaWorldPointCloudEnv
 
 OBJECT, GOAL = slice(4, 7), slice(-3, None)  # in what Meta-World tells its experts
 
@@ -36,12 +36,13 @@ def positions() -> None:
     observe = MetaWorldPointCloudEnv.observe
 
     def observe_more(env: MetaWorldPointCloudEnv) -> dict[str, np.ndarray]:
-        seen = observe(env)
-        told = np.concatenate([seen["agent_pos"], env.raw[OBJECT], env.raw[GOAL]])
-        return seen | {"agent_pos": told.astype(np.float32)}
+        observation = observe(env)
+        positions = [env.expert_observation[OBJECT], env.expert_observation[GOAL]]
+        state = np.concatenate([observation["agent_pos"], *positions])  # (9 + 6,)
+        return {"point_cloud": observation["point_cloud"], "agent_pos": state.astype(np.float32)}
 
     MetaWorldPointCloudEnv.observe = observe_more
-    simulator.RECIPE["positions_in_state"] += 2
+    metaworld_env.RECIPE["positions_in_state"] += 2
     for presets in baselines.PRESETS.values():
         for name, config in presets.items():
             presets[name] = replace(config, state_dim=config.state_dim + 6)
@@ -49,8 +50,8 @@ def positions() -> None:
 
 def pixels() -> None:
     """Doubles the camera's rows and columns."""
-    simulator.CAMERA_PIXELS *= 2
-    simulator.RECIPE["camera"][2] *= 2
+    metaworld_env.CAMERA_PIXELS *= 2
+    metaworld_env.RECIPE["camera"][2] *= 2
 
 
 def augmented_twice() -> None:
@@ -64,8 +65,12 @@ def not_averaged() -> None:
     train.ema_model = lambda policy: AveragedModel(policy, avg_fn=lambda mean, last, n: last)
 
 
-WORLDS = {"positions": positions, "pixels": pixels}
-WORLDS |= {"augmented-twice": augmented_twice, "not-averaged": not_averaged}
+WORLDS = {
+    "positions": positions,
+    "pixels": pixels,
+    "augmented-twice": augmented_twice,
+    "not-averaged": not_averaged,
+}
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ import html
 import json
 import os
 import pickle
+import pwd
 import warnings
 import zipfile
 from types import SimpleNamespace
@@ -305,7 +306,8 @@ def test_an_archive_in_the_official_layout_is_read_without_its_image_tower(
 
 def test_an_archive_with_another_sha256_is_refused(official):
     with pytest.raises(
-        ValueError, match=r"TorchScript archive with SHA-256 .* not the official 40d36571"
+        clip.TextWeightsError,
+        match=r"TorchScript archive with SHA-256 .* not the official 40d36571",
     ):
         load_clip_text_encoder(official[0])
 
@@ -321,19 +323,23 @@ def test_a_plain_state_dict_is_read_and_other_tensors_are_ignored(weights, tmp_p
 def test_a_file_cut_off_is_refused(official, weights, tmp_path):
     path = tmp_path / "cut.pt"
     path.write_bytes(official[0].read_bytes()[:1_000_000])
-    with pytest.raises(ValueError, match=r"cut\.pt: the file is cut off after 1000000 bytes"):
+    with pytest.raises(
+        clip.TextWeightsError, match=r"cut\.pt: the file is cut off after 1000000 bytes"
+    ):
         load_clip_text_encoder(path)
     torch.save(
         {"text_projection": weights["text_projection"]}, path, _use_new_zipfile_serialization=False
     )
     path.write_bytes(path.read_bytes()[:500_000])
-    with pytest.raises(ValueError, match=r"neither CLIP's ViT-B-32\.pt nor a plain state dict"):
+    with pytest.raises(
+        clip.TextWeightsError, match=r"neither CLIP's ViT-B-32\.pt nor a plain state dict"
+    ):
         load_clip_text_encoder(path)
 
 
 def test_a_missing_file_or_a_folder_is_refused(tmp_path):
     for path in (tmp_path / "none.pt", tmp_path):
-        with pytest.raises(ValueError, match="there is no such file"):
+        with pytest.raises(clip.TextWeightsError, match="there is no such file"):
             load_clip_text_encoder(path)
 
 
@@ -342,7 +348,7 @@ def test_a_missing_tensor_is_named(weights, tmp_path):
     del state["transformer.resblocks.3.mlp.c_fc.bias"]
     torch.save(state, tmp_path / "state.pt")
     with pytest.raises(
-        ValueError, match=r"'transformer\.resblocks\.3\.mlp\.c_fc\.bias' is missing"
+        clip.TextWeightsError, match=r"'transformer\.resblocks\.3\.mlp\.c_fc\.bias' is missing"
     ):
         load_clip_text_encoder(tmp_path / "state.pt")
 
@@ -350,7 +356,8 @@ def test_a_missing_tensor_is_named(weights, tmp_path):
 def test_a_tensor_of_another_shape_is_named(weights, tmp_path):
     torch.save(half(weights) | {"text_projection": torch.zeros(512, 640)}, tmp_path / "state.pt")
     with pytest.raises(
-        ValueError, match=r"'text_projection' has shape \(512, 640\), ViT-B/32's is \(512, 512\)"
+        clip.TextWeightsError,
+        match=r"'text_projection' has shape \(512, 640\), ViT-B/32's is \(512, 512\)",
     ):
         load_clip_text_encoder(tmp_path / "state.pt")
 
@@ -369,12 +376,16 @@ def test_no_file_can_run_code(tmp_path, monkeypatch):
     victim, path = tmp_path / "victim", tmp_path / "harmful.pt"
     for new in (True, False):
         torch.save({"text_projection": Harmful(victim)}, path, _use_new_zipfile_serialization=new)
-        with pytest.raises(ValueError, match=r"neither CLIP's ViT-B-32\.pt nor a plain state dict"):
+        with pytest.raises(
+            clip.TextWeightsError, match=r"neither CLIP's ViT-B-32\.pt nor a plain state dict"
+        ):
             load_clip_text_encoder(path)
     with zipfile.ZipFile(path, "w") as archive:  # scripted, with the wrong SHA-256: never opened
         archive.writestr("ViT-B-32/data.pkl", pickle.dumps(Harmful(victim), protocol=2))
         archive.writestr("ViT-B-32/constants.pkl", b"")
-    with pytest.raises(ValueError, match=r"a TorchScript archive with SHA-256 .* not the official"):
+    with pytest.raises(
+        clip.TextWeightsError, match=r"a TorchScript archive with SHA-256 .* not the official"
+    ):
         load_clip_text_encoder(path)
     assert not victim.exists()
 
@@ -388,14 +399,14 @@ def test_the_cache_is_used_and_a_damaged_cache_file_is_to_be_deleted(
     assert_holds(load_clip_text_encoder(), weights)
     cache.unlink()
     cache.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(ValueError, match=r"ViT-B-32\.pt: damaged.* delete it"):
+    with pytest.raises(clip.TextWeightsError, match=r"ViT-B-32\.pt: damaged.* delete it"):
         load_clip_text_encoder()
 
 
 def test_a_download_is_checked_and_kept(official, weights, cache, monkeypatch):
     path, sha256 = official
     monkeypatch.setattr(clip, "CLIP_URL", path.as_uri())
-    with pytest.raises(ValueError, match="another SHA-256 and was thrown away"):
+    with pytest.raises(clip.TextWeightsError, match="another SHA-256 and was thrown away"):
         load_clip_text_encoder()
     assert list(cache.parent.iterdir()) == []
     monkeypatch.setattr(clip, "CLIP_SHA256", sha256)
@@ -427,6 +438,21 @@ def test_without_network_the_tower_is_random_with_one_warning(cache, weights):
         len(features)
     )
     assert cosine.max() < 0.98  # instructions are told apart
+
+
+def test_a_user_without_a_home_folder_gets_random_weights_and_is_told_what_to_do(
+    cache, weights, monkeypatch
+):
+    def unknown_user(number):
+        raise KeyError(f"getpwuid(): uid not found: {number}")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", unknown_user)
+    monkeypatch.setattr(clip, "random_clip_weights", lambda seed: weights)
+    with pytest.warns(UserWarning, match="no home folder .* set XDG_CACHE_HOME") as caught:
+        assert load_clip_text_encoder().identity == "random-seed-0"
+    assert "To use CLIP, name its ViT-B-32.pt with --clip-weights" in str(caught[0].message)
 
 
 def test_with_downloading_off_the_network_is_not_asked(cache, weights, monkeypatch):
@@ -472,6 +498,6 @@ def test_only_the_text_weights_of_a_checkpoint_are_accepted(monkeypatch):
     assert text_features(["a", "b"], None, "random-seed-0")[0].shape == (2, 512)
     assert asked == ["random"]  # drawn again, without looking for CLIP's
     message = "made with the text weights 'openai-ViT-B-32-40d36571', here are 'random-seed-0'"
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(clip.TextWeightsError, match=message):
         text_features(["a"], None, "openai-ViT-B-32-40d36571")
     assert asked == ["random", None]

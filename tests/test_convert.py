@@ -3,6 +3,7 @@
 import json
 import pickle
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,12 +15,34 @@ import zarr
 from conftest import fails
 
 import convert
-from data import load_demonstrations
+from data import Demonstrations, load_demonstrations, save_demonstrations
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 RNG = np.random.default_rng(0)
 PICKLE = {"id": "pickle"}
 SAY = ["--instruction", "Stir the soup."]
+
+
+# ---- Pictures ------------------------------------------------------------------------------------
+
+
+def test_show_draws_a_picture_of_an_episode_that_there_is(capsys):
+    points = RNG.uniform(0.1, 1, (12, 16, 3)).astype(np.float16)
+    state, action = np.zeros((12, 9), np.float32), np.zeros((12, 4), np.float32)
+    ends = np.array([7, 12])
+    recording = Demonstrations("reach", "Move.", points, state, action, ends, meta={})
+    save_demonstrations("reach.npz", recording)
+    convert.main(["--show", "reach.npz", "--episode", "1"])
+    assert Path("reach.png").stat().st_size > 10_000
+    assert "reach.png" in capsys.readouterr().out
+    message = fails(convert, ["--show", "reach.npz", "--episode", "2"], capsys)
+    assert "reach.npz: holds episodes 0 to 1, not 2" in message
+
+
+def test_the_script_itself_ends_in_one_line_where_a_file_is_missing():
+    command = [sys.executable, convert.__file__, "--show", "nothing.npz"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2 and ended.stderr.startswith("error: nothing.npz is missing")
 
 
 # ---- DP3's zarr ----------------------------------------------------------------------------------
@@ -67,6 +90,7 @@ def test_a_replay_buffer_becomes_a_recording(zarr_format, zipped, capsys):
         ({"data__point_cloud": None}, SAY, "it lacks data/point_cloud"),
         ({"meta__episode_ends": None}, SAY, "it lacks meta/episode_ends"),
         ({"data__point_cloud": np.zeros((20, 30, 2))}, SAY, "must be (frames, points, 3)"),
+        ({"data__point_cloud": np.zeros((20, 30, 3))}, SAY, "all points of frame 0 are at 0, 0, 0"),
         ({"data__state": np.full(20, "x")}, SAY, "data/state must be plain numbers"),
         ({"data__action": np.zeros((19, 4))}, SAY, "lengths differ"),
         ({"meta__episode_ends": np.array([8, 21])}, SAY, "lengths differ"),

@@ -1,20 +1,23 @@
 """Tests of data.py against naive implementations, and with files that are wrong in many ways."""
 
 import json
+import os
+import stat
 from argparse import ArgumentParser
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-import convert
 import data
 import scripts
-from data import Demonstrations, WindowSampler
+from data import Demonstrations, RecordingError, WindowSampler
 from model import PolicyConfig
 
 SIZES = PolicyConfig(num_points=16)
+COLORED = SimpleNamespace(**{**asdict(SIZES), "point_dim": 6})
 
 
 def recording(lengths=(200, 30), points=16, seed=0):
@@ -30,6 +33,13 @@ def recording(lengths=(200, 30), points=16, seed=0):
         episode_ends=np.cumsum(lengths),
         meta={"made_by": "a test"},
     )
+
+
+def colored(recorded, seed=0):
+    """The same demonstrations with a colour, three numbers from 0 to 1, for each point."""
+    colors = np.random.default_rng(seed).uniform(0, 1, recorded.points.shape)
+    points = np.concatenate([recorded.points, colors.astype(np.float16)], axis=-1)
+    return replace(recorded, points=points)
 
 
 def seeded(seed=0):
@@ -92,8 +102,20 @@ def test_a_small_cloud_is_repeated_and_keeps_all_its_points(count):
 
 
 def test_an_empty_cloud_is_an_error():
-    with pytest.raises(ValueError, match="empty"):
-        data.farthest_point_sample(ball(0), 8)
+    for cloud in (ball(0), np.zeros((0, 6), np.float32)):
+        with pytest.raises(ValueError, match="empty"):
+            data.farthest_point_sample(cloud, 8)
+
+
+def test_distances_are_those_of_positions_and_points_keep_their_features():
+    rng = np.random.default_rng(0)
+    for count in (5, 700):
+        points = ball(count)
+        loud = 100 * rng.normal(size=(count, 3)).astype(np.float32)  # farther apart than the points
+        sample = data.farthest_point_sample(np.concatenate([points, loud], axis=1), 64)
+        np.testing.assert_array_equal(sample[:, :3], data.farthest_point_sample(points, 64))
+        feature_of = {tuple(point): tuple(feature) for point, feature in zip(points, loud)}
+        assert all(feature_of[tuple(row[:3])] == tuple(row[3:]) for row in sample)
 
 
 # ---- Files ---------------------------------------------------------------------------------------
@@ -112,14 +134,46 @@ def test_a_file_gives_back_what_was_saved(tmp_path):
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["reach.npz"]
 
 
+def test_points_with_colors_are_saved_and_read(tmp_path):
+    saved = colored(recording())
+    data.save_demonstrations(tmp_path / "reach.npz", saved)
+    np.testing.assert_array_equal(
+        data.load_demonstrations(tmp_path / "reach.npz").points, saved.points
+    )
+
+
 def test_the_first_episodes_are_taken():
     recorded = recording((50, 7, 120))
     taken = recorded.take(2)
     assert len(taken) == 2 and len(taken.points) == len(taken.state) == len(taken.action) == 57
     assert recorded.take(None) is recorded
     for n in (0, 4):
-        with pytest.raises(ValueError, match=f"{n} demonstrations of reach asked for, there are 3"):
+        message = f"{n} demonstrations of reach asked for, there are 3"
+        with pytest.raises(RecordingError, match=message):
             recorded.take(n)
+
+
+def test_the_last_episodes_are_held_out():
+    recorded = replace(recording((30, 20, 40, 25)), meta={"success_frames": [1, 2, 3, 4]}).take(3)
+    kept, heldout = data.hold_out(recorded, 2)
+    assert kept.episode_ends.tolist() == [30] and heldout.episode_ends.tolist() == [20, 60]
+    for part in ("points", "state", "action"):
+        np.testing.assert_array_equal(getattr(kept, part), getattr(recorded, part)[:30])
+        np.testing.assert_array_equal(getattr(heldout, part), getattr(recorded, part)[30:])
+    assert heldout.meta["success_frames"] == [2, 3]  # of its own episodes, and of no more
+    assert recorded.meta["success_frames"] == [1, 2, 3, 4]
+    kept.check()
+    heldout.check()
+
+
+def test_no_episode_or_all_but_one_can_be_held_out():
+    recorded = recording((50, 7, 120))
+    kept, heldout = data.hold_out(recorded, 0)
+    assert len(kept) == 3 and heldout is None
+    assert [len(part) for part in data.hold_out(recorded, 2)] == [1, 2]
+    for n in (3, 4, -1):
+        with pytest.raises(RecordingError, match="reach has 3 episodes: hold out fewer than that"):
+            data.hold_out(recorded, n)
 
 
 def test_a_failing_save_leaves_the_old_file(tmp_path, monkeypatch):
@@ -137,10 +191,87 @@ def test_a_failing_save_leaves_the_old_file(tmp_path, monkeypatch):
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
-def test_bad_demonstrations_are_not_saved(tmp_path):
-    with pytest.raises(ValueError, match="NaN"):
-        data.save_demonstrations(tmp_path / "reach.npz", replace(recording((20, 10)), points=NAN))
+def test_two_writers_of_one_file_do_not_meet(tmp_path):
+    """One process may write while another does, with the same number in another container."""
+    path, seen = tmp_path / "reach.txt", []
+
+    def slow(temporary):
+        temporary.write_text("first")
+        data.write_atomically(path, quick)
+        seen.append(path.read_text())
+        assert temporary.read_text() == "first"
+
+    def quick(temporary):
+        temporary.write_text("second")
+
+    data.write_atomically(path, slow)
+    assert seen == ["second"] and path.read_text() == "first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_writing_removes_nothing_that_is_of_others(tmp_path):
+    for name in (f".{os.getpid()}.a.npz", ".1.a.npz", ".2024-11-02.notes.md", ".unfinished-x"):
+        (tmp_path / name).write_text("mine")
+    before = {path: path.read_text() for path in tmp_path.iterdir()}
+    data.save_demonstrations(tmp_path / "a.npz", recording())
+    (tmp_path / "a.npz").unlink()
+    assert {path: path.read_text() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077, 0o002])
+def test_a_file_has_the_mode_that_open_gives(tmp_path, umask):
+    previous = os.umask(umask)
+    try:
+        data.write_text(tmp_path / "written.txt", "text")
+        (tmp_path / "opened.txt").write_text("text")
+    finally:
+        os.umask(previous)
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
+    assert modes["written.txt"] == modes["opened.txt"] == 0o666 & ~umask
+
+
+def test_a_temporary_file_keeps_the_suffix_that_some_writers_go_by(tmp_path):
+    data.write_atomically(tmp_path / "a.npz", lambda path: np.savez(path, x=np.arange(3)))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
+
+
+UNSAVABLE = [
+    ({"points": np.full((30, 16, 3), np.nan, np.float16)}, "points holds NaN"),
+    ({"task": b"reach"}, "task must be text .* not bytes"),
+    ({"instruction": b"Move."}, "instruction must be text .* not bytes"),
+    ({"instruction": None}, "instruction must be text .* not NoneType"),
+    ({"instruction": ["Move."]}, "instruction must be text .* not list"),
+    ({"state": [[0.0] * 9] * 30}, "state must be a NumPy array, not list"),
+    ({"action": torch.zeros(30, 4)}, "action must be a NumPy array, not Tensor"),
+    ({"episode_ends": [20, 30]}, "episode_ends must be a NumPy array, not list"),
+    ({"meta": None}, "meta must be a dict, not NoneType"),
+    ({"meta": {"positions_in_state": np.int64(1)}}, r"write x\.item\(\) .*int64"),
+    ({"meta": {"success_frames": np.array([1, 2])}}, r"or x\.tolist\(\)\): .*ndarray"),
+    ({"meta": {"made_by": b"me"}}, "meta must hold what JSON can .*bytes"),
+    ({"meta": {"simulator": 3}}, "simulator must be a name, not 3"),
+]
+
+
+@pytest.mark.parametrize("parts, message", UNSAVABLE)
+def test_what_could_not_be_read_again_is_not_saved(tmp_path, parts, message):
+    demonstrations = replace(recording((20, 10)), **parts)
+    with pytest.raises(RecordingError, match=message) as caught:
+        data.save_demonstrations(tmp_path / "reach.npz", demonstrations)
+    assert "\n" not in str(caught.value) and "reach.npz" in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+def with_feature(value):
+    """Clouds of one colour channel, whose last point's is another."""
+    points = np.full((30, 16, 4), 0.5, np.float16)
+    points[-1, -1, 3] = value
+    return points
+
+
+def with_empty_cloud(points):
+    """Points of frame 12 as an empty cloud is padded; their features stay as they are."""
+    points[12, :, :3] = 0
+    return points
 
 
 NAN = np.full((30, 16, 3), np.nan, np.float16)
@@ -162,6 +293,18 @@ BAD_PARTS = [
     ({"points": NAN}, "points holds NaN"),
     ({"state": np.full((30, 9), np.inf, np.float32)}, "state holds NaN"),
     ({"points": NAN[..., :2]}, "points must be"),
+    ({"points": with_feature(np.nan)}, "points holds NaN"),
+    ({"points": with_feature(255)}, "features of points reach 255: .* write colours from 0 to 1"),
+    ({"points": with_feature(-2)}, "features of points reach 2"),
+    ({"points": with_empty_cloud(np.zeros((30, 16, 3)))}, "all points of frame 0 are at 0, 0, 0"),
+    ({"points": with_empty_cloud(np.ones((30, 16, 3)))}, "all points of frame 12 are at 0, 0, 0"),
+    ({"points": with_empty_cloud(np.ones((30, 16, 6)))}, "all points of frame 12 are at 0, 0, 0"),
+    ({"instruction": b"Move."}, r"instruction must be text \(str\), not \|S5"),
+    ({"task": np.array(["reach"])}, r"task must be text \(str\), not <U5 \(1,\)"),
+    ({"instruction": np.array(3)}, r"instruction must be text \(str\), not int64"),
+    ({"meta": b"{}"}, r"meta must be text \(str\), not \|S2"),
+    ({"meta": "[1, 2]"}, "meta must be a dict, not list"),
+    ({"meta": "null"}, "meta must be a dict, not NoneType"),
     ({"points": np.zeros((30, 0, 3), np.float16)}, "points must be"),
     ({"action": np.zeros(30, np.float32)}, "action must be 2-dimensional"),
     ({"action": np.zeros((30, 4), np.int64)}, "action must be 2-dimensional"),
@@ -169,8 +312,12 @@ BAD_PARTS = [
     ({"episode_ends": np.array([20, 31])}, "lengths differ.*'episodes': 31"),
     ({"episode_ends": np.array([20, 20, 30])}, "growing whole numbers"),
     ({"episode_ends": np.array([20.0, 30.0])}, "growing whole numbers"),
+    ({"episode_ends": np.array([[20, 30]])}, "growing whole numbers"),
+    ({"episode_ends": np.array([0, 30])}, "growing whole numbers"),
+    ({"episode_ends": np.array([40, 30], np.uint64)}, "growing whole numbers"),
     (NO_FRAMES, "holds no episodes"),
     ({"action": np.zeros((30, 4), ">f4")}, "action must be 2-dimensional"),
+    ({"action": np.zeros((30, 4), np.longdouble)}, "action must be 2-dimensional"),
     ({"state": np.full((30, 9), 1e35)}, "state holds NaN or infinite numbers"),
     ({"points": np.full((30, 16, 3), 900, np.float16)}, "write them in metres"),
     ({"task": "re\0ach"}, "is no name"),
@@ -179,7 +326,8 @@ BAD_PARTS = [
         for wrong in ("x", [[0, 0, 0], [1, 1]], [[0, 0, None], [1, 1, 1]], [[0, 0, "x"], [1, 1, 1]])
     ),
     ({"state": np.array([None, 1], dtype=object)}, "is damaged or no .*: Object arrays"),
-    ({"meta": "not json"}, "is damaged or no .*: Expecting"),
+    ({"meta": "not json"}, "meta is no JSON: Expecting"),
+    ({"meta": "[" * 100_000}, "meta is no JSON"),
     *((meta(success_frames=wrong), "success_frames must") for wrong in ([1], [1, "2"], [1, -1], 1)),
     *((meta(positions_in_state=wrong), "positions_in_state is") for wrong in (4, -1, "3", True)),
     ({"action": np.zeros((30, 2), np.float32), **meta(positions_in_state=1)}, "a displacement"),
@@ -191,7 +339,7 @@ def test_a_file_with_bad_contents_is_refused_in_one_line(tmp_path, parts, messag
     path = tmp_path / "reach.npz"
     arrays = vars(recording((20, 10))) | {"meta": "{}"} | parts
     np.savez(path, **{part: value for part, value in arrays.items() if value is not None})
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(RecordingError, match=message) as caught:
         data.load_demonstrations(path)
     assert "\n" not in str(caught.value) and "reach.npz" in str(caught.value)
 
@@ -212,7 +360,7 @@ def test_a_missing_truncated_or_foreign_file_is_refused_in_one_line(tmp_path):
         path.unlink(missing_ok=True)
         if content is not None:
             path.write_bytes(content)
-        with pytest.raises(ValueError, match=message) as caught:
+        with pytest.raises(RecordingError, match=message) as caught:
             data.load_demonstrations(path)
         assert "\n" not in str(caught.value)
 
@@ -259,6 +407,26 @@ def test_windows_begin_up_to_so_many_frames_after_the_first_success():
     assert len(WindowSampler(untold, SIZES, after_success=5)) == len(every)
 
 
+def test_a_batch_is_drawn_in_an_order_that_never_changes():
+    """Results belong to a seed: first the reference, then the windows of the other episodes."""
+    sampler = WindowSampler(recording((40, 30, 50)), SIZES)
+    for n in (5, 200):  # fewer and more than there are
+        generator = seeded(n)
+        reference = int(torch.randint(3, (1,), generator=generator))
+        others = torch.tensor([i for i in range(99) if sampler.episode_of[i] != reference])
+        if n <= len(others):
+            chosen = others[torch.randperm(len(others), generator=generator)[:n]]
+        else:
+            chosen = others[torch.randint(len(others), (n,), generator=generator)]
+        expected = {**sampler.gather(chosen), **sampler.demonstration(reference)}
+
+        before = torch.get_rng_state()
+        batch = sampler.batch(n, seeded(n))
+        assert batch.keys() == expected.keys()
+        assert all(torch.equal(batch[name], x) for name, x in expected.items())
+        assert torch.equal(torch.get_rng_state(), before)  # nothing of the global generator
+
+
 def test_sampling_is_float32_repeatable_and_without_repetition():
     sampler = WindowSampler(recording(), SIZES)
     first, second = (sampler.sample(100, seeded()) for _ in range(2))
@@ -283,7 +451,7 @@ def test_a_demonstration_is_one_whole_episode_at_the_stride():
         "demo_action": (1, 4, 4),
     }
     assert all(x.dtype == torch.float32 for x in demo.values())
-    assert {sampler.draw_episode(seeded(seed)) for seed in range(20)} == {0, 1}
+    assert {sampler.sample_episode(seeded(seed)) for seed in range(20)} == {0, 1}
 
 
 def test_no_window_is_from_the_reference_demonstration_unless_it_is_the_only_one():
@@ -301,14 +469,27 @@ def test_no_window_is_from_the_reference_demonstration_unless_it_is_the_only_one
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"num_points": 32}, r"have \(9, 4, 16\) dimensions, the policy's have \(9, 4, 32\)"),
-        ({"state_dim": 7, "action_dim": 7}, r"have \(9, 4, 16\).* policy's have \(7, 7, 16\)"),
+        ({"num_points": 32}, "reach has 16 points a cloud, the policy 32: use recordings"),
+        ({"state_dim": 7}, "reach has 9 numbers a state, the policy 7: use recordings"),
+        ({"action_dim": 7}, "reach has 4 numbers an action, the policy 7: use recordings"),
+        ({"point_dim": 6}, "reach has 3 numbers a point, the policy 6: use recordings"),
         ({"demo_positions": 100}, "has 200 frames .* the policy 100 positions"),
     ],
 )
 def test_demonstrations_that_do_not_fit_the_policy_are_refused_with_both_numbers(changes, message):
-    with pytest.raises(ValueError, match=message):
-        WindowSampler(recording(), replace(SIZES, **changes))
+    with pytest.raises(RecordingError, match=message):
+        WindowSampler(recording(), SimpleNamespace(**{**asdict(SIZES), **changes}))
+
+
+def test_points_with_colors_reach_windows_and_demonstrations():
+    recorded = colored(recording((40, 30)))
+    with pytest.raises(RecordingError, match="has 6 numbers a point, the policy 3"):
+        WindowSampler(recorded, SIZES)
+    sampler = WindowSampler(recorded, COLORED)
+    batch = sampler.batch(8, seeded())
+    assert batch["points"].shape == (8, 2, 16, 6) and batch["demo_points"].shape[2:] == (16, 6)
+    known = {tuple(row) for row in recorded.points.reshape(-1, 6).astype(np.float32).tolist()}
+    assert {tuple(row) for row in batch["points"].flatten(0, 2).tolist()} <= known
 
 
 def test_the_length_of_a_demonstration_matters_only_where_it_is_encoded_in_order():
@@ -344,8 +525,10 @@ def test_scenes_are_moved_elsewhere_and_stay_consistent():
         assert torch.equal(state[..., 6:], before[prefix + "state"][..., 6:])
         assert torch.equal(action[..., 3:], before[prefix + "action"][..., 3:])
     shifts = (after["state"] - before["state"])[:, 0, :3]
-    assert len(torch.unique(shifts, dim=0)) == 12  # each window has its own
-    assert 0.02 < shifts.abs().max() < 0.3
+    demo_shift = (after["demo_state"] - before["demo_state"])[:, 0, :3]
+    shifts = torch.cat([shifts, demo_shift])
+    assert len(torch.unique(shifts, dim=0)) == 13  # each window and the demonstration its own
+    assert (shifts != 0).any(dim=1).all() and 0.02 < shifts.abs().max() < 0.3
 
     recorded.meta.clear()
     untold = WindowSampler(recorded, SIZES, augment=True).batch(12, seeded())
@@ -357,9 +540,22 @@ def test_scenes_are_moved_elsewhere_and_stay_consistent():
     assert 49 < asked[..., :3].abs().max() <= 50
 
 
+def test_colors_stay_as_they_are_where_scenes_are_moved():
+    recorded = recording((40, 30))
+    recorded.meta["positions_in_state"] = 1
+    plain = WindowSampler(recorded, SIZES, augment=True)
+    with_colors = WindowSampler(colored(recorded), COLORED, augment=True)
+    still = WindowSampler(colored(recorded), COLORED).batch(12, seeded())
+    expected, moved = plain.batch(12, seeded()), with_colors.batch(12, seeded())
+    for name in ("points", "demo_points"):
+        torch.testing.assert_close(moved[name][..., :3], expected[name])
+        assert torch.equal(moved[name][..., 3:], still[name][..., 3:])
+    assert torch.equal(with_colors.center, plain.center)
+
+
 def test_affine_maps_keep_to_their_limits_about_the_middle(monkeypatch):
     middle = torch.tensor([[0.02, 0.65, 0.2]])
-    a, b = data.draw_affine_maps(1000, middle, seeded())
+    a, b = data.sample_affine_maps(1000, middle, seeded())
     shift = (middle @ a.mT + b)[:, 0] - middle
     assert (shift.abs() <= torch.tensor(data.SHIFT) + 1e-6).all()
     assert (shift.abs().amax(0) > 0.04).all()
@@ -367,7 +563,7 @@ def test_affine_maps_keep_to_their_limits_about_the_middle(monkeypatch):
     assert (change < 3 * data.STRETCH + 2 * data.TURN).all()
 
     monkeypatch.setattr(data, "STRETCH", 0.0)
-    a, _ = data.draw_affine_maps(1000, middle, seeded())
+    a, _ = data.sample_affine_maps(1000, middle, seeded())
     torch.testing.assert_close(a @ a.mT, torch.eye(3).expand_as(a))  # only turns are left
     assert (a[:, 2] == torch.tensor([0.0, 0.0, 1.0])).all()
     angles = torch.atan2(a[:, 1, 0], a[:, 0, 0])
@@ -379,12 +575,12 @@ def test_scenes_turn_about_the_middle_of_the_workspace_or_else_of_the_points():
     recorded = recording()
     cloud = recorded.points.astype(np.float32)
     middle = (cloud.min((0, 1)) + cloud.max((0, 1))) / 2
-    np.testing.assert_allclose(WindowSampler(recorded, SIZES).middle[0], middle, rtol=1e-6)
+    np.testing.assert_allclose(WindowSampler(recorded, SIZES).center[0], middle, rtol=1e-6)
     recorded.meta["workspace"] = [[0, 0, 0], [1, 2, 3]]
-    assert WindowSampler(recorded, SIZES).middle.tolist() == [[0.5, 1.0, 1.5]]
+    assert WindowSampler(recorded, SIZES).center.tolist() == [[0.5, 1.0, 1.5]]
 
 
-# ---- Settings and command lines ------------------------------------------------------------------
+# ---- Settings and command lines of scripts.py, until it goes -------------------------------------
 
 
 @dataclass(frozen=True)
@@ -421,13 +617,6 @@ def test_a_setting_out_of_bounds_is_refused_in_the_words_of_the_command_line(cha
         Settings(**changes)
 
 
-def test_show_draws_a_picture(tmp_path, capsys):
-    data.save_demonstrations(tmp_path / "reach.npz", recording())
-    convert.main(["--show", str(tmp_path / "reach.npz")])
-    assert (tmp_path / "reach.png").stat().st_size > 10_000
-    assert "reach.png" in capsys.readouterr().out
-
-
 def say(error):
     raise error
 
@@ -435,7 +624,6 @@ def say(error):
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda: convert.main(["--show", "nothing.npz"]), "nothing.npz is missing"),
         (lambda: scripts.choose("shelf-plce", ["shelf-place", "push"], "task"), "'shelf-place'?"),
         (lambda: scripts.choose("x", ["push", "pull"], "task"), "choose one of: pull, push"),
         (lambda: say(PermissionError("no access")), "no access"),

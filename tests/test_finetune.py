@@ -221,7 +221,7 @@ def test_a_wrong_argument_ends_in_one_line_that_says_what_to_do(options, message
     "changes, options, message",
     [
         ({"frames": 220}, "", "has 11 frames (every 20th), the policy 10 positions"),
-        ({"action_dim": 7}, "", "(9, 7, 64) dimensions, the policy's have (9, 4, "),
+        ({"action_dim": 7}, "", "has 7 numbers an action, the policy 4: use"),
         ({"frames": 0, "ends": []}, "", "holds no episodes"),
         ({}, "--demonstrations 3", "3 demonstrations of stir asked for, there are 1"),
     ],

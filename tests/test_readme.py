@@ -7,15 +7,13 @@ from pathlib import Path
 
 import pytest
 
-import convert
-
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"^```bash\n(.*?)^```", README, re.M | re.S)
 LINES = [re.split(r"\s+# ", line)[0].strip() for block in BLOCKS for line in block.splitlines()]
 INLINE = re.findall(r"(?<!`)`((?:OMP_NUM_THREADS=\d+ )?(?:python|torchrun)\s[^`]+)`", README)
 COMMANDS = sorted({re.sub(r"\s+", " ", command) for command in LINES + INLINE if command})
-PARSERS = ("simulator", "train", "finetune", "evaluate", "robot")
+PARSERS = ("simulator", "train", "finetune", "evaluate", "robot", "convert")
 
 
 def test_the_readme_has_the_two_commands_and_many_more():
@@ -37,8 +35,6 @@ def test_every_command_parses(command, capsys, monkeypatch):
         assert all((ROOT / file).is_file() for file in re.findall(r"-r (\S+)", command))
     elif words[0] == "torchrun":
         importlib.import_module("train").parse(words[words.index("train.py") + 1 :])
-    elif words[1] == "data.py":
-        convert.parse(words[2:])
     elif words[1].removesuffix(".py") in PARSERS:
         importlib.import_module(words[1].removesuffix(".py")).parse(words[2:])
     elif words[1] == "-m":

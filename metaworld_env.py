@@ -1,0 +1,275 @@
+"""Meta-World as point clouds: its suites, the language instructions, the environment, the experts.
+
+    env = gymnasium.make("DAMI/MetaWorld-v0", task="reach")  # after `import metaworld_env`
+
+An observation is a cloud of N points and the positions of the end effector and the two fingers,
+world frame, metres. The clouds come from rays that camera.py casts. Class `MetaWorld` is what
+simulator.py knows of all this.
+
+Letters: N points of an observation.
+"""
+
+import warnings
+from dataclasses import dataclass
+from typing import ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+from metaworld import env_dict
+from metaworld.policies import ENV_POLICY_MAP
+
+from camera import RayCastCamera
+from common import choose
+from data import farthest_point_sample
+
+# Some experts ask for more than 1; their actions are clipped below.
+warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
+
+# ---- Suites and instructions ---------------------------------------------------------------------
+
+SUITES = {"ml10": env_dict.ML10_V3, "ml45": env_dict.ML45_V3}  # as `metaworld` itself splits them
+
+INSTRUCTIONS = {
+    "assembly": "Pick up the ring by its handle and slide it over the peg.",
+    "basketball": "Pick up the ball and drop it through the basketball hoop.",
+    "bin-picking": "Take the cube out of one bin and put it into the other bin.",
+    "box-close": "Pick up the lid by its handle and place it on the box.",
+    "button-press": "Push the button on the front of the machine all the way in.",
+    "button-press-topdown": "Press the button on top of the machine down from above.",
+    "button-press-topdown-wall": "Reach over the wall and press the button on top of the machine "
+    "down from above.",
+    "button-press-wall": "Reach around the wall and push the button on the front of the "
+    "machine in.",
+    "coffee-button": "Press the button of the coffee machine.",
+    "coffee-pull": "Pull the mug away from the coffee machine to the marked spot.",
+    "coffee-push": "Push the mug under the coffee machine to the marked spot.",
+    "dial-turn": "Turn the dial by half a revolution.",
+    "disassemble": "Grasp the ring by its handle and lift it off the peg.",
+    "door-close": "Push the open door of the safe until it is shut.",
+    "door-lock": "Turn the knob on the door down so that the door is locked.",
+    "door-open": "Pull the door of the safe open by its handle.",
+    "door-unlock": "Turn the knob on the door aside so that the door is unlocked.",
+    "drawer-close": "Push the open drawer back into the cabinet.",
+    "drawer-open": "Pull the drawer out of the cabinet by its handle.",
+    "faucet-close": "Turn the handle of the faucet clockwise to close it.",
+    "faucet-open": "Turn the handle of the faucet counterclockwise to open it.",
+    "hammer": "Pick up the hammer and drive the nail into the board.",
+    "hand-insert": "Move the gripper down into the hole in the table.",
+    "handle-press": "Push the long handle in front of you down.",
+    "handle-press-side": "Push the handle that points sideways down.",
+    "handle-pull": "Pull the long handle in front of you up.",
+    "handle-pull-side": "Pull the handle that points sideways up.",
+    "lever-pull": "Lift the lever until it points straight up.",
+    "peg-insert-side": "Pick up the peg and push it sideways into the hole of the box.",
+    "peg-unplug-side": "Pull the peg sideways out of the box.",
+    "pick-out-of-hole": "Pick the puck out of the hole and lift it to the marked spot.",
+    "pick-place": "Pick up the puck and hold it at the marked spot.",
+    "pick-place-wall": "Pick up the puck, lift it over the wall and hold it at the marked spot.",
+    "plate-slide": "Slide the plate away from the robot into the cabinet.",
+    "plate-slide-back": "Slide the plate out of the cabinet toward the robot.",
+    "plate-slide-back-side": "Slide the plate sideways out of the cabinet.",
+    "plate-slide-side": "Slide the plate sideways into the cabinet.",
+    "push": "Push the puck over the table to the marked spot.",
+    "push-back": "Pull the block back over the table to the marked spot.",
+    "push-wall": "Push the puck around the wall to the marked spot.",
+    "reach": "Move the gripper to the marked spot.",
+    "reach-wall": "Move the gripper over the wall to the marked spot.",
+    "shelf-place": "Pick up the cube and place it on the shelf.",
+    "soccer": "Push the ball into the goal.",
+    "stick-pull": "Pick up the stick, hook the container with it and pull the container "
+    "to the marked spot.",
+    "stick-push": "Pick up the stick and push the container with it to the marked spot.",
+    "sweep": "Sweep the cube off the side of the table.",
+    "sweep-into": "Sweep the cube into the hole in the table.",
+    "window-close": "Slide the window shut by its handle.",
+    "window-open": "Slide the window open by its handle.",
+}
+
+# ---- Environment ---------------------------------------------------------------------------------
+
+CAMERA = "corner2"
+CAMERA_POSITION = (0.6, 0.295, 0.8)  # world frame, metres; the orientation stays Meta-World's
+CAMERA_PIXELS = 84  # twice as many where something small is
+ARM_LINKS = tuple(f"right_l{i}" for i in range(7))  # without the hand and its fingers
+RENDER_PIXELS = 240
+WORKSPACE = ((-0.55, 0.3, -0.05), (0.6, 1.0, 0.48))  # the table and its holes, below the upper arm
+NUM_POINTS = 512
+NUM_OBJECT_POINTS = 384  # at most so many of a cloud are not of the arm
+EPISODE_STEPS = 200
+
+# How recordings are made. One that was made in another way is refused by `simulator.collect`.
+RECIPE = {
+    "simulator": "meta-world",
+    "camera": [CAMERA, list(CAMERA_POSITION), CAMERA_PIXELS, "twice where something small is"],
+    "arm": ["ellipsoids", "after at most", NUM_OBJECT_POINTS],
+    "workspace": [list(corner) for corner in WORKSPACE],
+    "num_points": NUM_POINTS,
+    "sampling": "farthest points",
+    "positions_in_state": 3,  # hand and fingers; actions begin with a displacement of the hand
+}
+
+
+class MetaWorldPointCloudEnv(gymnasium.Env):
+    """A Meta-World task as a point cloud; also `gymnasium.make("DAMI/MetaWorld-v0", task="reach")`.
+
+    Observation: "point_cloud" (N, 3) float32 and "agent_pos" (9,) float32, the positions of the end
+    effector, the right and the left finger; world frame, metres. A cloud begins with at most 384
+    farthest points of objects, goal marker and gripper, and is filled up with those of the arm.
+
+    Action (4,) in [-1, 1]: dx, dy, dz in centimetres, gripper (1 closes).
+
+    Episodes are truncated after `episode_steps` and never terminate. Each step tells
+    info["success"], and an episode succeeds if any of its steps does. Objects and goals are drawn
+    from the seed of an episode alone: the same seed gives the same episode.
+
+    Args:
+        task: one of INSTRUCTIONS. Raises UserError for another, with the nearest right one.
+        num_points: N.
+        render_mode: None or "rgb_array". `render` draws a picture in both cases.
+        episode_steps: the length of an episode.
+    """
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 80}
+
+    def __init__(
+        self,
+        task: str,
+        num_points: int = NUM_POINTS,
+        render_mode: str | None = None,
+        *,
+        episode_steps: int = EPISODE_STEPS,
+    ):
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode is {render_mode!r}; it can be None or 'rgb_array'")
+        self.task = choose(task, INSTRUCTIONS, "task")
+        self.num_points = num_points
+        self.render_mode = render_mode
+        self.episode_steps = episode_steps
+        self.steps = 0  # since the beginning of the episode
+
+        sawyer_env = env_dict.ALL_V3_ENVIRONMENTS[f"{task}-v3"]()
+        sawyer_env._set_task_called = True
+        sawyer_env._freeze_rand_vec = False  # draw objects and goals at each reset ...
+        sawyer_env.seeded_rand_vec = True  # ... from a generator of its own, not NumPy's global
+        sawyer_env._partially_observable = False  # the expert needs the goal
+        del sawyer_env.sawyer_observation_space  # cached with the goal hidden: clips it to zero
+        self.sawyer_env = sawyer_env
+        self.expert = ENV_POLICY_MAP[f"{task}-v3"]()
+
+        self.camera = RayCastCamera(
+            sawyer_env.model,
+            pixels=CAMERA_PIXELS,
+            box=WORKSPACE,
+            camera=CAMERA,
+            position=CAMERA_POSITION,
+            arm=ARM_LINKS,
+        )
+        self.observation_space = gymnasium.spaces.Dict(
+            {
+                "point_cloud": gymnasium.spaces.Box(-np.inf, np.inf, (num_points, 3), np.float32),
+                "agent_pos": gymnasium.spaces.Box(-np.inf, np.inf, (9,), np.float32),
+            }
+        )
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        """Begins an episode; without a seed one is drawn. Returns (observation, info)."""
+        super().reset(seed=seed)
+        self.begin(int(self.np_random.integers(2**31)) if seed is None else seed)
+        return self.observe(), {"success": False}
+
+    def begin(self, seed: int) -> None:
+        """Begins the episode of this seed without casting rays."""
+        self.sawyer_env.seed(seed)
+        self.expert_observation, _ = self.sawyer_env.reset()
+        # Without this the markers are still where the last episode had them.
+        mujoco.mj_forward(self.sawyer_env.model, self.sawyer_env.data)
+        self.steps = 0
+
+    def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
+        """Takes one step: `advance`, then `observe`."""
+        reward, truncated, info = self.advance(action)
+        return self.observe(), reward, False, truncated, info
+
+    def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
+        """Takes one step without casting rays. Returns (reward, truncated, info)."""
+        action = np.clip(np.asarray(action, dtype=np.float32), -1, 1)
+        if action.shape != (4,) or not np.isfinite(action).all():
+            raise ValueError(f"an action is four finite numbers, not {action}")
+
+        self.expert_observation, reward, _, _, info = self.sawyer_env.step(action)
+        self.steps += 1
+        truncated = self.steps >= self.episode_steps
+        return float(reward), truncated, {"success": bool(info["success"])}
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """Casts the rays and returns the observation of the present moment."""
+        data = self.sawyer_env.data
+        hand = data.body("hand").xpos
+        right_finger = data.site("rightEndEffector").xpos
+        left_finger = data.site("leftEndEffector").xpos
+        positions = np.concatenate([hand, right_finger, left_finger])  # (9,)
+        return {"point_cloud": self.cloud(), "agent_pos": positions.astype(np.float32)}
+
+    def cloud(self) -> np.ndarray:
+        """Returns N of the points that the camera sees, (N, 3) float32, the arm's last.
+
+        Where it sees fewer, they are repeated from the first one. Raises ValueError where it sees
+        none.
+        """
+        N, data = self.num_points, self.sawyer_env.data
+        cloud = self.camera.points(data)  # (M, 3)
+        if len(cloud) > 0:
+            cloud = farthest_point_sample(cloud, min(N, NUM_OBJECT_POINTS, len(cloud)))
+        if len(cloud) < N:
+            arm = self.camera.arm_points(data)
+            if len(arm) > 0:
+                arm = farthest_point_sample(arm, min(N - len(cloud), len(arm)))
+            cloud = np.concatenate([cloud, arm])
+        if len(cloud) == 0:
+            raise ValueError(f"{self.task}: the camera sees no point inside the workspace")
+        return np.resize(cloud, (N, 3))
+
+    def expert_action(self) -> np.ndarray:
+        """Returns the scripted expert's action (4,) float32 in [-1, 1] for the present moment."""
+        return np.clip(self.expert.get_action(self.expert_observation), -1, 1).astype(np.float32)
+
+    def render(self) -> np.ndarray:
+        """Returns a picture (240, 240, 3) uint8 from the camera of the point clouds."""
+        return self.camera.render(self.sawyer_env.data, RENDER_PIXELS)
+
+    def close(self) -> None:
+        self.sawyer_env.close()
+
+    @property
+    def simulator(self) -> gymnasium.Env:  # old name, until its callers are rewritten
+        return self.sawyer_env
+
+
+if "DAMI/MetaWorld-v0" not in gymnasium.registry:
+    gymnasium.register("DAMI/MetaWorld-v0", entry_point=f"{__name__}:MetaWorldPointCloudEnv")
+
+# ---- For simulator.py ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MetaWorld:
+    """Meta-World as a `simulator.Simulator`."""
+
+    episode_steps: int = EPISODE_STEPS
+    name: ClassVar[str] = RECIPE["simulator"]
+    instructions: ClassVar[dict[str, str]] = INSTRUCTIONS
+    recipe: ClassVar[dict] = RECIPE
+    packages: ClassVar[tuple[str, ...]] = ("metaworld", "mujoco")
+
+    def tasks(self, suite: str) -> tuple[list[str], list[str]]:
+        """Returns the (base, novel) tasks of "ml10" or "ml45"."""
+        split = SUITES[suite]
+        base = [name.removesuffix("-v3") for name in split["train"]]
+        novel = [name.removesuffix("-v3") for name in split["test"]]
+        return base, novel
+
+    def make(self, task: str, num_points: int) -> MetaWorldPointCloudEnv:
+        """Makes an environment of a task whose clouds have `num_points` points."""
+        return MetaWorldPointCloudEnv(task, num_points, episode_steps=self.episode_steps)
