@@ -1,6 +1,6 @@
 """Tests of evaluate.py: which checkpoint, rollouts, swapped inputs, animations, bad input.
 
-Most roll out in tests/toy.py, which takes milliseconds, and without other processes.
+Most roll out in toy_simulator.py, which takes milliseconds, and without other processes.
 """
 
 import json
@@ -8,11 +8,13 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
 from conftest import fails
+from toy_simulator import COLORS, ToySimulator
 
 import clip
 import common
@@ -21,9 +23,8 @@ import evaluate
 import model
 import simulator
 import tests.unseen
-from tests.toy import PLACES, Toy
 
-TASKS = ["left", "right"]  # base tasks of the toy; "ahead" is its novel one
+TASKS = ["touch-red", "touch-green"]  # base tasks of the toy; touch-blue is its novel one
 INFO = {
     "suite": "toy",
     "preset": "tiny",
@@ -34,8 +35,9 @@ INFO = {
 
 
 def features(instructions, weights, identity):
-    """In place of CLIP: one-hot vectors, by the instruction's last word."""
-    rows = [list(PLACES).index(text.rstrip(".").split()[-1]) for text in instructions]
+    """In place of CLIP: one-hot vectors, by the color in the instruction."""
+    colors = [next(color for color in COLORS if color in text) for text in instructions]
+    rows = [list(COLORS).index(color) for color in colors]
     return 10 * torch.eye(512)[rows], identity or "words"
 
 
@@ -48,7 +50,7 @@ def run_here(job, jobs, *, workers, total, description, setup):
 @pytest.fixture(autouse=True)
 def toy(monkeypatch, own_folder):
     """The toy is one of the simulators, and nothing is rolled out in other processes."""
-    monkeypatch.setitem(simulator.SIMULATORS, "toy", Toy)
+    monkeypatch.setitem(simulator.SIMULATORS, "toy", ToySimulator)
     monkeypatch.setattr(evaluate, "text_features", features)
     monkeypatch.setattr(evaluate, "run_jobs", run_here)
     monkeypatch.setattr(evaluate, "worker_state", {})
@@ -58,13 +60,14 @@ def toy(monkeypatch, own_folder):
 def recordings(tmp_path_factory):
     """Three expert demonstrations of each of the toy's tasks: task -> file."""
     folder = tmp_path_factory.mktemp("toy")
-    paths = {task: folder / f"{task}.npz" for task in PLACES}
+    toy = ToySimulator()
+    paths = {task: folder / f"{task}.npz" for task in toy.instructions}
     for task, path in paths.items():
-        simulator.collect_task(Toy(), task, path, episodes=3, seed=0)
+        simulator.collect_task(toy, task, path, episodes=3, seed=0)
     return paths
 
 
-def fit(config, recordings, steps=60):
+def fit(config, recordings, steps=20):
     """A policy that has learned a little of the toy."""
     torch.manual_seed(0)
     policy, generator = model.build_policy(config), torch.Generator().manual_seed(0)
@@ -73,8 +76,7 @@ def fit(config, recordings, steps=60):
         for task in TASKS
     }
     policy.normalizer.fit(samplers.values())
-    instructions = [f"Move to the ball {task}." for task in TASKS]
-    text, _ = features(instructions, None, None)
+    text, _ = features(TASKS, None, None)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
     for step in range(steps):
         task = step % 2
@@ -94,19 +96,23 @@ def trained(recordings):
     return fit(TINY, recordings)
 
 
+@pytest.fixture(scope="session")
+def untrained(recordings):
+    return fit(TINY, recordings, steps=1)
+
+
 @pytest.fixture
-def run(trained):
+def run(trained, untrained):
     """The folder of a run in the toy, with two checkpoints; it is in the present folder."""
     folder = Path("runs/toy-tiny-seed0")
     folder.mkdir(parents=True)
-    untrained = model.build_policy(TINY)
     model.save(folder / "ema-00003.pt", untrained, **{**INFO, "step": 3})
     model.save(folder / "ema-00006.pt", trained, **INFO)
     return folder
 
 
 def command(run, recordings, options=""):
-    folder = recordings["left"].parent
+    folder = recordings["touch-red"].parent
     common = f"--checkpoint {run} --data {folder} --demonstrations 2 --device cpu"
     return [*common.split(), *options.split()]
 
@@ -178,10 +184,13 @@ def test_the_policy_that_ships_opens_windows(recorded, monkeypatch):
 
 
 def test_any_simulator_is_recorded_and_rolled_out_in_by_its_protocol(monkeypatch, recordings):
-    recorded = data.load_demonstrations(recordings["left"])
-    assert recorded.instruction == "Move to the ball left." and len(recorded) == 3
+    recorded = data.load_demonstrations(recordings["touch-red"])
+    assert recorded.instruction == "Touch the red ball." and len(recorded) == 3
     sampler, text = data.WindowSampler(recorded, TINY), torch.zeros(512)
-    policy, toys = model.build_policy(TINY), [Toy().make("left", 64) for _ in range(2)]
+    policy, toys = (
+        model.build_policy(TINY),
+        [ToySimulator().make("touch-red", 64) for _ in range(2)],
+    )
 
     def roll_out():
         return evaluate.rollout(
@@ -195,16 +204,16 @@ def test_any_simulator_is_recorded_and_rolled_out_in_by_its_protocol(monkeypatch
         return torch.from_numpy(actions)[:, None].expand(-1, 8, -1)
 
     monkeypatch.setattr(policy, "sample_actions", ask_the_experts)
-    assert roll_out() == [True, True] and all(env.steps < 24 for env in toys)
+    assert roll_out() == [True, True] and all(env.steps < 12 for env in toys)
     monkeypatch.setattr(policy, "sample_actions", lambda *inputs: -ask_the_experts(*inputs))
-    assert roll_out() == [False, False] and all(env.steps == 24 for env in toys)
+    assert roll_out() == [False, False] and all(env.steps == 12 for env in toys)
 
 
 def test_clouds_with_colors_are_rolled_out_on(recordings):
-    colored, config = Toy(colored=True), replace(TINY, point_dim=6)
-    simulator.collect_task(colored, "left", "left.npz", episodes=2, seed=0)
-    sampler = data.WindowSampler(data.load_demonstrations("left.npz"), config)
-    policy, environment = model.build_policy(config), colored.make("left", 64)
+    colored, config = ToySimulator(colored=True), replace(TINY, point_dim=6)
+    simulator.collect_task(colored, "touch-red", "red.npz", episodes=2, seed=0)
+    sampler = data.WindowSampler(data.load_demonstrations("red.npz"), config)
+    policy, environment = model.build_policy(config), colored.make("touch-red", 64)
     successes = evaluate.rollout(
         policy, [environment], [0], sampler, torch.zeros(512), torch.Generator()
     )
@@ -212,12 +221,12 @@ def test_clouds_with_colors_are_rolled_out_on(recordings):
 
 
 def test_in_worker_processes_the_episodes_are_the_same(run, recordings, monkeypatch, capsys):
-    checkpoint, text = run / "ema-00006.pt", dict(zip(PLACES, 10 * torch.eye(512)))
+    checkpoint, text = run / "ema-00003.pt", dict(zip(recordings, 10 * torch.eye(512)))
     monkeypatch.setattr(evaluate, "EPISODES_A_JOB", 4)
 
     def measure(**options):
         return evaluate.evaluate_checkpoint(
-            checkpoint, Toy(), recordings, text, episodes=10, seed=3, **options
+            checkpoint, ToySimulator(), recordings, text, episodes=10, seed=3, **options
         )
 
     here = measure()
@@ -239,7 +248,12 @@ def test_ten_episodes_are_rolled_out_side_by_side(run, recordings, monkeypatch):
     monkeypatch.setattr(evaluate, "rollout", count)
     text = dict.fromkeys(TASKS, torch.zeros(512))
     evaluate.evaluate_checkpoint(
-        run / "ema-00006.pt", Toy(), {"left": recordings["left"]}, text, episodes=23, seed=7
+        run / "ema-00006.pt",
+        ToySimulator(),
+        {"touch-red": recordings["touch-red"]},
+        text,
+        episodes=23,
+        seed=7,
     )
     first = simulator.evaluation_seed(7, 0)
     assert calls == [
@@ -252,7 +266,7 @@ def test_ten_episodes_are_rolled_out_side_by_side(run, recordings, monkeypatch):
 def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordings, monkeypatch):
     frames = []
 
-    class Watched(Toy):
+    class Watched(ToySimulator):
         def make(self, task, num_points):
             environment = super().make(task, num_points)
             observe = environment.observe
@@ -277,10 +291,10 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
         return np.stack(frames)
 
     evaluate.prepare_worker(run / "ema-00003.pt", Watched(), "cpu", {})
-    alone = job("left", 1)
-    for task, episode in [("left", 0), ("right", 0), ("left", 1)]:
+    alone = job("touch-red", 1)
+    for task, episode in [("touch-red", 0), ("touch-green", 0), ("touch-red", 1)]:
         later = job(task, episode)
-    assert len(alone) > 3 and np.array_equal(alone, later)
+    assert len(alone) > 1 and np.array_equal(alone, later)
 
 
 def test_known_goals_are_those_of_the_demonstrations(run, recordings, monkeypatch):
@@ -291,8 +305,8 @@ def test_known_goals_are_those_of_the_demonstrations(run, recordings, monkeypatc
         return [True] * len(options["seeds"])
 
     monkeypatch.setattr(evaluate, "rollout", keep_seeds)
-    text = {"left": torch.zeros(512)}
-    known = data.load_demonstrations(recordings["left"]).meta["episode_seeds"]
+    text = {"touch-red": torch.zeros(512)}
+    known = data.load_demonstrations(recordings["touch-red"]).meta["episode_seeds"]
     for options, expected in (
         ({"episodes": 20}, known),
         ({"episodes": 20, "n_demonstrations": 2}, known[:2]),
@@ -301,8 +315,8 @@ def test_known_goals_are_those_of_the_demonstrations(run, recordings, monkeypatc
         seeds.clear()
         evaluate.evaluate_checkpoint(
             run / "ema-00006.pt",
-            Toy(),
-            {"left": recordings["left"]},
+            ToySimulator(),
+            {"touch-red": recordings["touch-red"]},
             text,
             known_goals=True,
             **options,
@@ -427,10 +441,10 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
     written = report_of("report")
     [label] = written["successes"]
     assert label == "toy-tiny-seed0/ema-00006" and "checkpoints" not in written
-    text, _ = features(["left", "right"], None, None)
+    text, _ = features(["touch-red", "touch-green"], None, None)
     assert written["successes"][label] == evaluate.evaluate_checkpoint(
         run / "ema-00006.pt",
-        Toy(),
+        ToySimulator(),
         {task: recordings[task] for task in TASKS},
         dict(zip(TASKS, text)),
         episodes=5,
@@ -445,7 +459,7 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
     assert {"hardware", "date", "mean, last checkpoint"} <= set(provenance)
     assert "sampler" not in provenance
     printed = capsys.readouterr().out
-    assert "| left " in printed and "| **mean** " in printed and "paper" not in printed
+    assert "| touch-red " in printed and "| **mean** " in printed and "paper" not in printed
     assert "mean, last checkpoint: " in printed
 
 
@@ -474,11 +488,11 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordi
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
     swap = "--swap demonstration instruction --episodes 2"
     evaluate.main(command(run, recordings, f"{swap} --split all --out swapped"))
-    following = {"left": "right", "right": "ahead", "ahead": "left"}
+    following = {"touch-red": "touch-green", "touch-green": "touch-blue", "touch-blue": "touch-red"}
     own, demonstration, instruction = calls
-    assert own[0] == instruction[0] == {task: task for task in PLACES}
+    assert own[0] == instruction[0] == {task: task for task in ToySimulator().instructions}
     assert demonstration[0] == following and demonstration[1] is own[1]
-    assert all(torch.equal(instruction[1][t], own[1][following[t]]) for t in PLACES)
+    assert all(torch.equal(instruction[1][t], own[1][following[t]]) for t in following)
     written = report_of("swapped")
     assert [name.split(", ")[-1] for name in written["successes"]][1:] == [
         "demonstration of another task",
@@ -504,10 +518,8 @@ def test_a_run_of_another_policy_stands_beside_that_policys_published_numbers(
 ):
     """The toy plays ML10: its tasks are renamed to two of that suite."""
 
-    class Renamed(Toy):
-        def __init__(self):
-            super().__init__()
-            self.instructions = {"reach": "Move to the ball left.", "push": "... ball right."}
+    class Renamed(ToySimulator):
+        instructions: ClassVar[dict] = {"reach": "To the red ball.", "push": "To the green ball."}
 
         def tasks(self, suite):
             return ["reach", "push"], []
@@ -561,11 +573,11 @@ def test_old_results_stay_where_the_new_ones_are_refused(run, recordings, monkey
 
 
 def test_a_rollout_can_be_watched(run, recordings, capsys):
-    evaluate.main(command(run, recordings, "--task left --gif left.gif"))
-    assert Path("left.gif").read_bytes().startswith(b"GIF8")
-    assert Path("left.gif").stat().st_size > 10_000
+    evaluate.main(command(run, recordings, "--task touch-red --gif x.gif"))
+    assert Path("x.gif").read_bytes().startswith(b"GIF8")
+    assert Path("x.gif").stat().st_size > 10_000
     printed = capsys.readouterr()
-    assert "wrote left.gif" in printed.out
+    assert "wrote x.gif" in printed.out
     assert "rolling out: " in printed.err and "drawing: 100%" in printed.err
     assert not Path("runs/evaluation").exists()
 
@@ -575,27 +587,27 @@ def test_every_second_step_and_the_last_moment_are_filmed(trained, recordings, m
     monkeypatch.setattr(
         evaluate, "animate", lambda frames, title, *_: films.append((frames, title))
     )
-    sampler = data.WindowSampler(data.load_demonstrations(recordings["left"]), TINY)
+    sampler = data.WindowSampler(data.load_demonstrations(recordings["touch-red"]), TINY)
     made = []
 
-    class Kept(Toy):
+    class Kept(ToySimulator):
         def make(self, task, num_points):
             made.append(super().make(task, num_points))
             return made[-1]
 
-    text, _ = features(["left"], None, None)
+    text, _ = features(["touch-red"], None, None)
     success = evaluate.write_animation(
-        trained, Kept(), sampler, text[0], seed=2, path=Path("left.gif")
+        trained, Kept(), sampler, text[0], seed=2, path=Path("x.gif")
     )
     [(frames, title)], [environment] = films, made
-    assert title == f"left: {'success' if success else 'failure'}"
+    assert title == f"touch-red: {'success' if success else 'failure'}"
     assert [frame.step for frame in frames] == [*range(0, environment.steps, 2), environment.steps]
     np.testing.assert_array_equal(frames[-1].cloud, environment.observe()["point_cloud"])
     np.testing.assert_array_equal(frames[-1].picture, environment.render())
-    assert not np.array_equal(frames[0].cloud, frames[-1].cloud)
+    assert not np.array_equal(frames[0].picture, frames[-1].picture)
     [again] = evaluate.rollout(  # filming changes nothing
         trained,
-        [Toy().make("left", 64)],
+        [ToySimulator().make("touch-red", 64)],
         [simulator.evaluation_seed(2, 0)],
         sampler,
         text[0],
@@ -611,14 +623,14 @@ def test_an_adapted_policy_is_watched_from_its_folder(
     monkeypatch.setattr(
         evaluate, "write_animation", lambda p, s, sampler, *_, **__: seen.append(sampler.task)
     )
-    Path("all/ahead").mkdir(parents=True)
-    model.save("all/ahead/adapted.pt", trained, **{**INFO, "adapted_to": "ahead"})
-    evaluate.main(command("all/ahead", recordings, "--gif x.gif"))
-    assert seen == ["ahead"] and "is novel" not in capsys.readouterr().out
+    Path("all/touch-blue").mkdir(parents=True)
+    model.save("all/touch-blue/adapted.pt", trained, **{**INFO, "adapted_to": "touch-blue"})
+    evaluate.main(command("all/touch-blue", recordings, "--gif x.gif"))
+    assert seen == ["touch-blue"] and "is novel" not in capsys.readouterr().out
     message = fails(evaluate, command("all", recordings, "--gif x.gif"), capsys)
-    assert "holds no checkpoint: name all/ahead" in message
-    evaluate.main(command(run, recordings, "--gif x.gif --task ahead"))
-    assert "ahead is novel to this policy: `python finetune.py" in capsys.readouterr().out
+    assert "holds no checkpoint: name all/touch-blue" in message
+    evaluate.main(command(run, recordings, "--gif x.gif --task touch-blue"))
+    assert "touch-blue is novel to this policy: `python finetune.py" in capsys.readouterr().out
 
 
 def test_a_movie_is_written_by_what_is_there(monkeypatch):
@@ -645,19 +657,19 @@ def test_a_movie_is_written_by_what_is_there(monkeypatch):
         ("--workers 0", "--workers is 0: use at least 1"),
         ("--seed -1", "seed -1 is out of range"),
         ("--seed 1000", "seed 1000 is out of range"),
-        ("--task lef", "did you mean 'left'?"),
+        ("--task touch-rd", "did you mean 'touch-red'?"),
         ("--suite ml-45", "did you mean 'ml45'?"),
         ("--n-action-steps 99", "n_action_steps"),
         ("--top -1", "--top is -1: use at least 0"),
         ("--top 5", "holds 2 checkpoints, fewer than --top"),
         ("--swap instruction --top 2", "leave out --top"),
         ("--swap instruction --known-goals", "leave out --swap"),
-        ("--swap instruction --task left", "leave out --task"),
-        ("--gif left.gif", "name its task"),
-        ("--gif left.gif --task left --known-goals", "leave out --known-goals"),
-        ("--gif left.gif --task left --without demonstration", "--without demonstration"),
-        ("--gif left.avi --task left", "name it .gif or .mp4"),
-        ("--gif none/left.gif --task left", "there is no such folder"),
+        ("--swap instruction --task touch-red", "leave out --task"),
+        ("--gif x.gif", "name its task"),
+        ("--gif x.gif --task touch-red --known-goals", "leave out --known-goals"),
+        ("--gif x.gif --task touch-red --without demonstration", "--without demonstration"),
+        ("--gif x.avi --task touch-red", "name it .gif or .mp4"),
+        ("--gif none/x.gif --task touch-red", "there is no such folder"),
         ("--out runs/toy-tiny-seed0", "holds a training run: choose another --out"),
         ("--checkpoint runs/toy-tiny-seed0 runs/toy-tiny-seed0", "rename one's folder"),
         ("--device cuda:99", "cannot be used here"),
@@ -673,8 +685,13 @@ def test_a_mistake_ends_in_one_line_that_says_what_to_do(
 @pytest.mark.parametrize(
     "info, others, options, message",
     [
-        ({"adapted_to": "ahead"}, [], "--task left", "was adapted to ahead, not to left"),
-        ({"adapted_to": "ahead"}, ["run"], "", "was adapted to ahead: measure it alone"),
+        (
+            {"adapted_to": "touch-blue"},
+            [],
+            "--task touch-red",
+            "was adapted to touch-blue, not to touch-red",
+        ),
+        ({"adapted_to": "touch-blue"}, ["run"], "", "was adapted to touch-blue: measure it alone"),
         ({"adaptation": {"instruction": False}}, ["run"], "", "not both at once"),
         ({"text_weights": "others"}, ["run"], "", "made with text weights 'others'"),
         ({"suite": "own"}, [], "", "no simulator to be measured in"),
@@ -735,7 +752,7 @@ def test_the_action_error_is_the_mean_absolute_error_over_executed_chunks(monkey
     assert all((demo < 10).all() for demo in shown_to)  # an episode that was trained on
 
 
-def test_a_policy_that_was_trained_has_a_small_action_error(trained, recordings):
+def test_a_policy_that_was_trained_has_a_small_action_error(trained, untrained, recordings):
     train_samplers, heldout_samplers = {}, {}
     for task in TASKS:
         kept, heldout = data.hold_out(data.load_demonstrations(recordings[task]), 1)
@@ -746,7 +763,6 @@ def test_a_policy_that_was_trained_has_a_small_action_error(trained, recordings)
     assert list(errors) == TASKS
     for error, error_of_mean in errors.values():
         assert error < 0.7 * error_of_mean
-    untrained = model.build_policy(TINY)
     others = evaluate.evaluate_heldout(untrained, train_samplers, heldout_samplers, text)
     assert all(others[task][0] > errors[task][0] for task in TASKS)
     assert evaluate.evaluate_heldout(trained, train_samplers, {}, text) == {}
@@ -756,7 +772,7 @@ def test_checkpoints_are_judged_on_episodes_that_no_training_saw(
     run, trained, recordings, monkeypatch, capsys
 ):
     monkeypatch.setattr(tests.unseen, "SUITE", "toy")
-    folder = recordings["left"].parent
+    folder = recordings["touch-red"].parent
     Path("seen").mkdir()
     for task in TASKS:
         recorded = data.load_demonstrations(folder / f"{task}.npz")
