@@ -4,7 +4,7 @@
     python train.py --policy mamba --maml off           # multi-task training instead of MAML
     python baselines.py                                 # the size of each policy and preset
 
-`dp3` is `model.DAMIPolicy` without demonstration and instruction. The other three see what it sees,
+`dp3` is model.py's policy without demonstration and instruction. The other three see what it sees,
 two observations, and each changes one thing:
 
     flow    FlowPolicy: what is learned. A velocity from noise to actions, consistent along its way,
@@ -14,10 +14,11 @@ two observations, and each changes one thing:
     freq    FreqPolicy: what is drawn. Low frequencies of the actions first, then all of them, by a
             masked Transformer and a small diffusion for each action.
 
-Each class is a `DAMIPolicy` with another `loss`, `sample_actions` or network, so that training,
+Each class is a `DP3Policy` with another `loss`, `sample_actions` or network, so that training,
 adaptation, evaluation and checkpoints are the same. All that is random (noise, times, masks) comes
 with the batch: a loss is a pure function with a second derivative, as MAML needs, `torch.vmap`
-included. What the publications leave open, or their code does otherwise, each class says.
+included. What the publications leave open, or their code does otherwise, each class says. Importing
+this file adds the policies, their networks and the ablation of VMT to the dictionaries of model.py.
 
 Letters are model.py's: B windows, To observation steps, H horizon, A action dim, C condition width,
 L length of a sequence inside the U-Net. Here also W width of a Transformer, M channels inside a
@@ -28,7 +29,7 @@ import argparse
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -36,14 +37,18 @@ from torch import Generator, Tensor, nn
 
 import model
 from model import (
+    POLICIES,
     Attention,
     ConditionalUNet1d,
     Context,
-    DAMIPolicy,
+    DP3Policy,
     LayerNorm,
     PolicyConfig,
     ResidualBlock,
     TransformerBlock,
+    build_policy,
+    demo_encoders,
+    denoisers,
     sinusoids,
 )
 
@@ -61,7 +66,7 @@ def draw(
 # ---- FlowPolicy ----------------------------------------------------------------------------------
 
 
-class FlowPolicy(DAMIPolicy):
+class FlowPolicy(DP3Policy):
     """Consistency flow matching with DP3's network (Zhang et al., AAAI 2025, arXiv 2412.04987).
 
     Noise a0 and data a1 lie at the ends of a line, x_t = t a1 + (1 - t) a0. The network learns a
@@ -81,21 +86,33 @@ class FlowPolicy(DAMIPolicy):
     observations on.
     """
 
-    START, STEP, SEGMENTS, WEIGHT = 0.01, 0.01, 2, 1e-5  # t >= START, r = t + STEP
+    requires: ClassVar = {"sampler": "ddim"}  # it has a sampler of its own, so there is no choice
+
+    START = 0.01  # of t
+    STEP = 0.01  # from t to r
+    SEGMENTS = 2  # of the line
+    WEIGHT = 1e-5  # of the difference between the velocities
     TIMESTEPS = 99  # the time embedding reads 99 t, as a diffusion's reads 0 to 99
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
         """Draws what makes `loss` pure: noise (n, H, A), times (n,) in [0.01, 1)."""
-        H, A, like = self.config.horizon, self.config.action_dim, self.normalizer.action_scale
+        H, A = self.config.horizon, self.config.action_dim
+        like = self.normalizer.action_scale
         noise = draw(torch.randn, n, H, A, like=like, generator=generator)
         times = draw(torch.rand, n, like=like, generator=generator)
         return {"noise": noise, "times": self.START + (1 - self.START) * times}
 
     def shapes(self) -> dict[str, tuple[int | str, ...]]:
-        return super().shapes() | {"times": ("B",)}
+        return {**super().shapes(), "times": ("B",)}
 
     def loss(
-        self, points: Tensor, state: Tensor, action: Tensor, noise: Tensor, times: Tensor, **task
+        self,
+        points: Tensor,
+        state: Tensor,
+        action: Tensor,
+        noise: Tensor,
+        times: Tensor,
+        **task: Tensor,
     ) -> Tensor:
         """The consistency of the velocity, () float; arguments as of `DAMIPolicy.loss`.
 
@@ -108,12 +125,18 @@ class FlowPolicy(DAMIPolicy):
         t = times.to(clean.dtype)[:, None, None]  # (B, 1, 1)
         r = (t + self.STEP).clamp(max=1)  # where it is 1, f_r is a1
         s = (self.SEGMENTS * t).ceil() / self.SEGMENTS  # the end of t's segment
-        x_t, x_r = (z * clean + (1 - z) * noise for z in (t, r))  # 2 x (B, H, A)
+        x_t = t * clean + (1 - t) * noise  # (B, H, A)
+        x_r = r * clean + (1 - r) * noise  # (B, H, A)
 
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
-        both = torch.cat([x_t, x_r]), torch.cat([t, r]).flatten()  # 2 B: one pass for both
-        v_t, v_r = self.velocity(*both, observation.repeat(2, 1)).chunk(2)  # 2 x (B, H, A)
-        f_t, f_r = x_t + (s - t) * v_t, x_r + (s - r) * v_r
+        velocities = self.velocity(  # one pass for both times
+            torch.cat([x_t, x_r]),  # (2 B, H, A)
+            torch.cat([t, r]).flatten(),  # (2 B,)
+            observation.repeat(2, 1),  # (2 B, To * feature)
+        )
+        v_t, v_r = velocities.chunk(2)  # 2 x (B, H, A)
+        f_t = x_t + (s - t) * v_t
+        f_r = x_r + (s - r) * v_r
         far = s - t > 1.01 * self.STEP
         distance = (f_t - f_r) ** 2 + self.WEIGHT * far * (v_t - v_r) ** 2  # (B, H, A)
         return distance.mean() / self.STEP**2
@@ -129,13 +152,12 @@ class FlowPolicy(DAMIPolicy):
         self, points: Tensor, state: Tensor, context: Context, generator: Generator | None = None
     ) -> Tensor:
         """Draws an action chunk (B, Ta, A) in one step, a0 + v(a0); as `DAMIPolicy`'s does."""
-        config = self.config
         self.check_shapes(points=points, state=state)
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
-        shape = (len(points), config.horizon, config.action_dim)
-        noise = draw(torch.randn, *shape, like=points, generator=generator)
-        start = torch.full((len(points),), self.START, device=points.device)
-        return self.executed(noise + self.velocity(noise, start, observation))
+        B, H, A = len(points), self.config.horizon, self.config.action_dim
+        noise = draw(torch.randn, B, H, A, like=points, generator=generator)
+        start = torch.full((B,), self.START, device=points.device)
+        return self.select_action_chunk(noise + self.velocity(noise, start, observation))
 
 
 # ---- Mamba Policy --------------------------------------------------------------------------------
@@ -164,11 +186,13 @@ class Mamba(nn.Module):
     seen: place l of the result depends on places 0 to l.
     """
 
-    STATES, KERNEL = 16, 4
+    STATES = 16  # J
+    KERNEL = 4
 
     def __init__(self, width: int):
         super().__init__()
-        inner, rank = 2 * width, math.ceil(width / 16)
+        inner = 2 * width  # M
+        rank = math.ceil(width / 16)
         self.sizes = (rank, self.STATES, self.STATES)
         self.project_in = nn.Linear(width, 2 * inner, bias=False)
         self.kernel = nn.Parameter(torch.rand(self.KERNEL, inner) - 0.5)  # +-1 / sqrt(KERNEL)
@@ -205,8 +229,10 @@ class MixerBlock(nn.Module):
 
     def __init__(self, mixer: nn.Module, width: int):
         super().__init__()
-        self.norm1, self.norm2 = LayerNorm(width), LayerNorm(width)
-        self.mixer, wide = mixer, 4 * width
+        self.norm1 = LayerNorm(width)
+        self.norm2 = LayerNorm(width)
+        self.mixer = mixer
+        wide = 4 * width
         self.mlp = nn.Sequential(nn.Linear(width, wide), nn.GELU(), nn.Linear(wide, width))
 
     def forward(self, x: Tensor, keep: Tensor) -> Tensor:
@@ -218,30 +244,30 @@ class MixerBlock(nn.Module):
 class MambaResidualBlock(nn.Module):
     """DP3's residual block with a Mamba and an attention in place of the second convolution."""
 
-    HEADS, BRANCHES = 8, 4
+    HEADS = 8
+    BRANCHES = 4  # Mamba and its MLP, attention and its MLP: what stochastic depth may leave out
 
     def __init__(self, block: ResidualBlock, config: PolicyConfig, index: int):
         super().__init__()
         self.conv1, self.film, self.residual = block.conv1, block.film, block.residual
-        self.condition_dim, self.first = config.condition_dim, index * self.BRANCHES
+        self.condition_dim, self.first_branch = config.condition_dim, index * self.BRANCHES
         width = self.conv1[0].out_channels
         self.mamba = MixerBlock(Mamba(width), width)
         self.attention = MixerBlock(Attention(width, self.HEADS), width)
 
-    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        """x (B, d_in, L), condition (B, C) or with drop_path behind it -> (B, d_out, L)."""
-        h, factors = condition.tensor_split([self.condition_dim], dim=1)  # (B, C), (B, branches)
-        keep = factors[:, self.first : self.first + self.BRANCHES]  # (B, 4)
-        if factors.shape[1] == 0:  # nothing is dropped when actions are drawn
-            keep = torch.ones_like(h[:, : self.BRANCHES])
+    def forward(self, x: Tensor, condition_and_drop_path: Tensor) -> Tensor:
+        """x (B, d_in, L), [condition | drop_path] (B, C + branches) -> (B, d_out, L)."""
+        h, drop_path = condition_and_drop_path.tensor_split([self.condition_dim], dim=1)
+        keep = drop_path[:, self.first_branch : self.first_branch + self.BRANCHES]  # (B, 4)
         scale, bias = self.film(h)[..., None].chunk(2, dim=1)  # 2 x (B, d_out, 1)
         y = (scale * self.conv1(x) + bias).transpose(1, 2)  # (B, L, d_out)
-        y = self.attention(self.mamba(y, keep[:, :2]), keep[:, 2:])
+        y = self.mamba(y, keep[:, :2])
+        y = self.attention(y, keep[:, 2:])
         return y.transpose(1, 2) + self.residual(x)
 
 
 class MambaUNet1d(ConditionalUNet1d):
-    """DP3's U-Net with other residual blocks. Its condition may end with `drop_path`."""
+    """DP3's U-Net with other residual blocks, whose branches `drop_path` leaves out or scales."""
 
     def __init__(self, config: PolicyConfig):
         super().__init__(config)
@@ -250,8 +276,24 @@ class MambaUNet1d(ConditionalUNet1d):
             self.set_submodule(name, MambaResidualBlock(block, config, index))
         self.branches = len(blocks) * MambaResidualBlock.BRANCHES
 
+    def forward(
+        self,
+        actions: Tensor,
+        h: Tensor,
+        fused: Tensor | None = None,
+        drop_path: Tensor | None = None,
+    ) -> Tensor:
+        """As the U-Net's; drop_path (B, branches) has a factor for each branch, None: all are 1."""
+        if drop_path is None:
+            drop_path = torch.ones(len(h), self.branches, dtype=h.dtype, device=h.device)
+        # The U-Net gives one tensor to each of its blocks, and each block takes both from it.
+        h = torch.cat([h, drop_path], dim=1)  # (B, C + branches)
+        if fused is not None:
+            fused = torch.cat([fused, drop_path], dim=1)
+        return super().forward(actions, h, fused)
 
-class MambaPolicy(DAMIPolicy):
+
+class MambaPolicy(DP3Policy):
     """DP3 with a Mamba and an attention in every residual block (Cao et al., arXiv 2409.07163).
 
     In training each of a block's four branches is left out for a fifth of the windows, and
@@ -261,33 +303,55 @@ class MambaPolicy(DAMIPolicy):
     build it and do not run it. Here it runs. Widths, kernel and horizon are that code's.
     """
 
-    network = MambaUNet1d
-    DROP = 0.2
+    requires: ClassVar = {"denoiser": "mamba-unet"}
+
+    DROP = 0.2  # the share of windows that a branch is left out for
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
-        """Draws noise and timesteps as `DAMIPolicy` does, and drop_path (n, branches)."""
+        """Draws noise and timesteps as `DAMIPolicy` does, and drop_path (n, branches).
+
+        drop_path is 0 for what is left out, and 1.25 for what is kept.
+        """
         drawn = super().draw_noise_and_timesteps(n, generator)
-        shape, like = (n, self.unet.branches), self.normalizer.action_scale
-        kept = draw(torch.rand, *shape, like=like, generator=generator) >= self.DROP
-        return drawn | {"drop_path": kept / (1 - self.DROP)}
+        like = self.normalizer.action_scale
+        uniform = draw(torch.rand, n, self.denoiser.branches, like=like, generator=generator)
+        drawn["drop_path"] = (uniform >= self.DROP) / (1 - self.DROP)
+        return drawn
 
-    def encode_demo(
-        self, *task: Tensor, drop_path: Tensor | None = None, **named: Tensor
-    ) -> Context:
-        """`drop_path` (windows, branches), 0 or 1.25 for each branch, where a context stands."""
-        super().encode_demo(*task, **named)  # reads nothing, and refuses what is not a task
-        return drop_path
+    def shapes(self) -> dict[str, tuple[int | str, ...]]:
+        return {**super().shapes(), "drop_path": ("B", self.denoiser.branches)}
 
-    def denoise(
-        self, noisy: Tensor, timesteps: Tensor, observation: Tensor, context: Context
+    def loss(
+        self,
+        points: Tensor,
+        state: Tensor,
+        action: Tensor,
+        noise: Tensor,
+        timesteps: Tensor,
+        drop_path: Tensor,
+        **task: Tensor,
     ) -> Tensor:
-        """As `DAMIPolicy`'s; the context is `drop_path`, or None: nothing is dropped."""
-        h = self.unet.condition(timesteps, observation)  # (B, C)
-        if context is not None:
-            if context.shape != (shape := (len(h), self.unet.branches)):
-                raise ValueError(f"drop_path is {tuple(context.shape)}, the policy takes {shape}")
-            h = torch.cat([h, context.to(h.dtype)], dim=1)  # (B, C + branches)
-        return self.unet(noisy, h)
+        """The diffusion loss, () float; arguments as of `DAMIPolicy.loss`.
+
+        drop_path (B, branches) float: the factor of each branch; of `task` nothing is read.
+        """
+        self.encode_demo(**task)
+        self.check_shapes(
+            points=points,
+            state=state,
+            action=action,
+            noise=noise,
+            timesteps=timesteps,
+            drop_path=drop_path,
+        )
+        clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
+        noisy = self.schedule.add_noise(clean, noise, timesteps)  # A_k, (B, H, A)
+        observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
+        h = self.condition_encoder(timesteps, observation)  # (B, C)
+        prediction = self.denoiser(noisy, h, drop_path=drop_path.to(h.dtype))  # (B, H, A)
+        return F.mse_loss(prediction, clean)
+
+    forward = loss
 
 
 # ---- FreqPolicy ----------------------------------------------------------------------------------
@@ -344,14 +408,16 @@ class DiffusionHead(nn.Module):
     def __init__(self, config: PolicyConfig):
         super().__init__()
         W, width = config.unet_widths
-        A, self.timestep_dim = config.action_dim, config.timestep_dim
-        self.horizon = config.horizon
-        self.project_x = nn.Linear(A, width)
-        self.project_z, self.project_cutoff = nn.Linear(W, width), nn.Linear(1, width)
-        layers = nn.Linear(self.timestep_dim, width), nn.SiLU(), nn.Linear(width, width)
-        self.timestep_mlp = nn.Sequential(*layers)
+        self.horizon, self.timestep_dim = config.horizon, config.timestep_dim
+        self.project_x = nn.Linear(config.action_dim, width)
+        self.project_z = nn.Linear(W, width)
+        self.project_cutoff = nn.Linear(1, width)
+        self.timestep_mlp = nn.Sequential(
+            nn.Linear(config.timestep_dim, width), nn.SiLU(), nn.Linear(width, width)
+        )
         self.blocks = nn.ModuleList(ModulatedMLP(width) for _ in range(self.BLOCKS))
-        self.modulation, self.out = zeroed(nn.Linear(width, 2 * width)), zeroed(nn.Linear(width, A))
+        self.modulation = zeroed(nn.Linear(width, 2 * width))
+        self.out = zeroed(nn.Linear(width, config.action_dim))
 
     def forward(self, noisy: Tensor, timesteps: Tensor, z: Tensor, cutoffs: Tensor) -> Tensor:
         """noisy (B, H, A), timesteps (B, H), z (B, H, W), cutoffs (B,) -> noise (B, H, A)."""
@@ -366,32 +432,36 @@ class DiffusionHead(nn.Module):
 
 
 class FrequencyTransformer(nn.Module):
-    """A masked autoencoder over the H actions, read through a diffusion head.
+    """FreqPolicy's network alone: a masked autoencoder over the H actions, and a diffusion head.
 
     The sequence is [To observations | cut-off | H actions]. The encoder sees the actions that are
     not hidden, the decoder a learned token in place of those that are. Of the configuration it
     reads `unet_widths` as its own width and the head's.
     """
 
-    LAYERS, HEADS = 4, 8
+    LAYERS = 4  # of the encoder, and of the decoder
+    HEADS = 8
 
     def __init__(self, config: PolicyConfig):
         super().__init__()
+        if config.policy != "freq":
+            raise ValueError(f"frequency-transformer is the denoiser of freq, not {config.policy}")
         if len(config.unet_widths) != 2:
             raise ValueError(f"freq takes two widths, Transformer and head: {config.unet_widths}")
         H, W, prefix = config.horizon, config.unet_widths[0], config.n_obs_steps + 1
-        dct = dct_matrix(H)
-        self.register_buffer("dct", dct.float(), persistent=False)
+        self.register_buffer("dct", dct_matrix(H).float(), persistent=False)
         self.project_observation = nn.Linear(config.observation_feature_dim, W)
-        self.project_cutoff, self.project_action = nn.Linear(1, W), nn.Linear(config.action_dim, W)
+        self.project_cutoff = nn.Linear(1, W)
+        self.project_action = nn.Linear(config.action_dim, W)
         self.encoder_positions = nn.Parameter(0.02 * torch.randn(prefix + H, W))
         self.decoder_positions = nn.Parameter(0.02 * torch.randn(prefix + H, W))
         self.head_positions = nn.Parameter(0.02 * torch.randn(H, W))
         self.hidden_token = nn.Parameter(0.02 * torch.randn(W))
-        heads, layers = self.HEADS, range(self.LAYERS)
-        self.encoder = nn.ModuleList(MaskedBlock(W, heads) for _ in layers)
-        self.decoder = nn.ModuleList(TransformerBlock(W, heads) for _ in layers)
-        self.norm_in, self.norm_encoder, self.norm_decoder = (LayerNorm(W) for _ in range(3))
+        self.encoder = nn.ModuleList(MaskedBlock(W, self.HEADS) for _ in range(self.LAYERS))
+        self.decoder = nn.ModuleList(TransformerBlock(W, self.HEADS) for _ in range(self.LAYERS))
+        self.norm_in = LayerNorm(W)
+        self.norm_encoder = LayerNorm(W)
+        self.norm_decoder = LayerNorm(W)
         self.project_decoder = nn.Linear(W, W)
         self.head = DiffusionHead(config)
 
@@ -404,8 +474,12 @@ class FrequencyTransformer(nn.Module):
     def forward(self, observation: Tensor, low: Tensor, mask: Tensor, cutoffs: Tensor) -> Tensor:
         """observation (B, To, feature), low (B, H, A), mask (B, H), cutoffs (B,) -> z (B, H, W)."""
         share = (cutoffs / low.shape[1])[:, None, None].to(low.dtype)  # (B, 1, 1)
-        prefix = [self.project_observation(observation), self.project_cutoff(share)]
-        x = torch.cat([*prefix, self.project_action(low)], dim=1)  # (B, To + 1 + H, W)
+        tokens = [
+            self.project_observation(observation),
+            self.project_cutoff(share),
+            self.project_action(low),
+        ]
+        x = torch.cat(tokens, dim=1)  # (B, To + 1 + H, W)
         visible = torch.zeros_like(observation[..., 0], dtype=torch.bool)  # (B, To)
         hidden = torch.cat([visible, visible[:, :1], mask], dim=1)  # (B, To + 1 + H)
 
@@ -419,7 +493,7 @@ class FrequencyTransformer(nn.Module):
         return self.norm_decoder(x)[:, -low.shape[1] :] + self.head_positions  # (B, H, W)
 
 
-class FreqPolicy(DAMIPolicy):
+class FreqPolicy(DP3Policy):
     """Masked autoregression over frequencies (Zhong et al., arXiv 2506.01583).
 
     Training: the first c frequencies of an action chunk, c from 0 to H, most of its places hidden,
@@ -433,31 +507,34 @@ class FreqPolicy(DAMIPolicy):
     DDIM steps (`small`: five) whose clean action is clipped (there: ten random ones, unclipped).
     """
 
-    network = FrequencyTransformer
-    ROUNDS, LEAST_HIDDEN, DEVIATION = 4, 0.7, 0.25
+    requires: ClassVar = {"denoiser": "frequency-transformer", "sampler": "ddim"}
+    conditioned_by_h = False  # its network embeds timesteps and observations itself
+
+    ROUNDS = 4
+    LEAST_HIDDEN = 0.7  # the share of hidden places is normal around 1, cut to [0.7, 1] ...
+    DEVIATION = 0.25  # ... with this standard deviation
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
-        """Draws noise (n, H, A), timesteps (n, H), cutoffs (n,), mask (n, H) of n windows.
-
-        The share of hidden places is normal around 1 and cut to [0.7, 1].
-        """
+        """Draws noise (n, H, A), timesteps (n, H), cutoffs (n,), mask (n, H) of n windows."""
         H, A, K = self.config.horizon, self.config.action_dim, self.config.diffusion_steps
-        options = {"like": self.normalizer.action_scale, "generator": generator}
-        noise = draw(torch.randn, n, H, A, **options)
-        timesteps = (K * draw(torch.rand, n, H, **options)).long().clamp(max=K - 1)
-        cutoffs = ((H + 1) * draw(torch.rand, n, **options)).long().clamp(max=H)
+
+        def uniform(*shape: int) -> Tensor:
+            return draw(torch.rand, *shape, like=self.normalizer.action_scale, generator=generator)
+
+        noise = draw(torch.randn, n, H, A, like=self.normalizer.action_scale, generator=generator)
+        timesteps = (K * uniform(n, H)).long().clamp(max=K - 1)
+        cutoffs = ((H + 1) * uniform(n)).long().clamp(max=H)
         z = torch.tensor((self.LEAST_HIDDEN - 1) / self.DEVIATION, device=noise.device)
         below = torch.special.ndtr(z)  # the distribution function runs from here to 1 / 2
-        quantile = below + (0.5 - below) * draw(torch.rand, n, **options)
+        quantile = below + (0.5 - below) * uniform(n)
         share = 1 + self.DEVIATION * torch.special.ndtri(quantile)  # (n,)
-        rank = draw(torch.rand, n, H, **options).argsort(dim=1)  # (n, H)
+        rank = uniform(n, H).argsort(dim=1)  # (n, H)
         mask = rank < (H * share).ceil()[:, None]
         return {"noise": noise, "timesteps": timesteps, "cutoffs": cutoffs, "mask": mask}
 
     def shapes(self) -> dict[str, tuple[int | str, ...]]:
         H = self.config.horizon
-        own = {"timesteps": ("B", H), "cutoffs": ("B",), "mask": ("B", H)}
-        return super().shapes() | own
+        return {**super().shapes(), "timesteps": ("B", H), "cutoffs": ("B",), "mask": ("B", H)}
 
     def loss(
         self,
@@ -476,15 +553,25 @@ class FreqPolicy(DAMIPolicy):
         for hidden places. Of `task` nothing is read.
         """
         self.encode_demo(**task)
-        drawn = {"noise": noise, "timesteps": timesteps, "cutoffs": cutoffs, "mask": mask}
-        self.check_shapes(points=points, state=state, action=action, **drawn)
-
+        self.check_shapes(
+            points=points,
+            state=state,
+            action=action,
+            noise=noise,
+            timesteps=timesteps,
+            cutoffs=cutoffs,
+            mask=mask,
+        )
         clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
-        tokens = (x.flatten(0, 1)[:, None] for x in (clean, noise))  # 2 x (B * H, 1, A)
-        noisy = self.schedule.add_noise(*tokens, timesteps.flatten()).view_as(clean)  # (B, H, A)
+        noisy = self.schedule.add_noise(  # each action has its own timestep
+            clean.flatten(0, 1)[:, None],  # (B * H, 1, A)
+            noise.flatten(0, 1)[:, None],
+            timesteps.flatten(),
+        ).view_as(clean)  # (B, H, A)
         observation = self.encode_observations(points, state)  # (B, To, feature)
-        z = self.unet(observation, self.unet.low_pass(clean, cutoffs), mask, cutoffs)  # (B, H, W)
-        return F.mse_loss(self.unet.head(noisy, timesteps, z, cutoffs), noise)
+        low = self.denoiser.low_pass(clean, cutoffs)  # (B, H, A)
+        z = self.denoiser(observation, low, mask, cutoffs)  # (B, H, W)
+        return F.mse_loss(self.denoiser.head(noisy, timesteps, z, cutoffs), noise)
 
     forward = loss
 
@@ -493,33 +580,33 @@ class FreqPolicy(DAMIPolicy):
         self, points: Tensor, state: Tensor, context: Context, generator: Generator | None = None
     ) -> Tensor:
         """Draws an action chunk (B, Ta, A) in four rounds, from low frequencies to all of them."""
-        config, options = self.config, {"like": points, "generator": generator}
         self.check_shapes(points=points, state=state)
         observation = self.encode_observations(points, state)  # (B, To, feature)
-        B, H, A = len(points), config.horizon, config.action_dim
-        rank = draw(torch.rand, B, H, **options).argsort(dim=1)  # (B, H): who is shown last
+        B, H, A = len(points), self.config.horizon, self.config.action_dim
+        order = draw(torch.rand, B, H, like=points, generator=generator)  # (B, H)
+        rank = order.argsort(dim=1)  # (B, H): places of high rank are shown first
         actions = torch.zeros(B, H, A, device=points.device)
 
         for done in range(self.ROUNDS):
             cutoffs = torch.full((B,), done * H // (self.ROUNDS - 1), device=points.device)
             mask = rank < int(H * math.cos(math.pi / 2 * done / self.ROUNDS))  # 16, 14, 11, 6 of 16
-            low = self.unet.low_pass(actions, cutoffs)
-            z = self.unet(observation, low, mask, cutoffs)  # (B, H, W)
-            actions = draw(torch.randn, B, H, A, **options)
+            low = self.denoiser.low_pass(actions, cutoffs)
+            z = self.denoiser(observation, low, mask, cutoffs)  # (B, H, W)
+            actions = draw(torch.randn, B, H, A, like=points, generator=generator)
             for k in self.schedule.timesteps():
                 timesteps = torch.full((B, H), k, device=points.device)
-                noise = self.unet.head(actions, timesteps, z, cutoffs)
+                noise = self.denoiser.head(actions, timesteps, z, cutoffs)
                 a = self.schedule.alphas_cumprod[k]
                 clean = (actions - (1 - a).sqrt() * noise) / a.sqrt()
                 actions = self.schedule.step(clean, k, actions)
-        return self.executed(actions)
+        return self.select_action_chunk(actions)
 
 
-# ---- Ablations of DAMI ---------------------------------------------------------------------------
+# ---- The ablation of VMT -------------------------------------------------------------------------
 
 
 class DemonstrationMLP(nn.Module):
-    """The ablation of VMT: an MLP on every frame, averaged over time."""
+    """What stands in for VMT in the ablation: an MLP on every frame, averaged over time."""
 
     def __init__(self, config: PolicyConfig):
         super().__init__()
@@ -532,107 +619,81 @@ class DemonstrationMLP(nn.Module):
         return self.mlp(torch.cat([features, actions], dim=-1)).mean(dim=1, keepdim=True)
 
 
-class PooledTask(nn.Module):
-    """What stands in for U2T in the ablation's rows without TCFM, "Baseline" (mlp) and "+ VMT".
+# ---- Names, presets and sizes --------------------------------------------------------------------
 
-    The paper does not say how a demonstration enters there. Here its tokens, averaged over time,
-    and the instruction go through one linear layer and are added to h_k, for every block.
-    """
-
-    def __init__(self, config: PolicyConfig):
-        super().__init__()
-        self.projection = nn.Linear(config.demo_dim + config.text_dim, config.condition_dim)
-
-    def encode_context(self, demo_tokens: Tensor, text: Tensor) -> tuple[Tensor, ...]:
-        """demo_tokens (D, T, demo_dim), text (D, text_dim) -> ((D, C),)."""
-        return (self.projection(torch.cat([demo_tokens.mean(dim=1), text], dim=-1)),)
-
-    def forward(self, h: Tensor, context: tuple[Tensor, ...]) -> Tensor:
-        """h_k (B, C) and the context of D = B / G tasks -> (B, C)."""
-        return h + context[0].repeat_interleave(len(h) // len(context[0]), dim=0)
+POLICIES["flow"] = FlowPolicy
+POLICIES["mamba"] = MambaPolicy
+POLICIES["freq"] = FreqPolicy
+denoisers["mamba-unet"] = MambaUNet1d
+denoisers["frequency-transformer"] = FrequencyTransformer
+demo_encoders["mlp"] = DemonstrationMLP
 
 
-class AblatedPolicy(DAMIPolicy):
-    """DAMI with an MLP in place of VMT, without TCFM, or both."""
-
-    demo_encoders: ClassVar = DAMIPolicy.demo_encoders | {"mlp": DemonstrationMLP}
-
-    def __init__(self, config: PolicyConfig):
-        super().__init__(config)
-        if config.tcfm == "none":
-            self.u2t = PooledTask(config)
-
-    def denoise(
-        self, noisy: Tensor, timesteps: Tensor, observation: Tensor, context: Context
-    ) -> Tensor:
-        """As `DAMIPolicy`'s; without TCFM every level reads the task."""
-        if self.config.tcfm != "none":
-            return super().denoise(noisy, timesteps, observation, context)
-        h = self.unet.condition(timesteps, observation)  # (B, C)
-        return self.unet(noisy, self.u2t(h, context))
+def changed(preset: str, **changes: Any) -> PolicyConfig:
+    """DAMI's preset of a name with `changes`, and without a task."""
+    return replace(model.PRESETS[preset], demo_encoder="none", tcfm="none", **changes)
 
 
-# ---- Presets and sizes ---------------------------------------------------------------------------
-
-POLICIES = {"dami": DAMIPolicy, "dp3": DAMIPolicy}
-POLICIES |= {"flow": FlowPolicy, "mamba": MambaPolicy, "freq": FreqPolicy}
-
-
-def build_policy(config: PolicyConfig) -> DAMIPolicy:
-    """The policy that a configuration describes, with fresh weights."""
-    problem = None
-    if config.policy != "dami" and config.reads_task:
-        problem = "reads no task: use demo_encoder none and tcfm none"
-    if config.policy in ("flow", "freq") and config.sampler != "ddim":
-        problem = f"has a sampler of its own: leave out {config.sampler}"
-    if problem:
-        raise ValueError(f"{config.policy} {problem}")
-    whole = config.demo_encoder != "mlp" and (config.tcfm != "none" or not config.reads_task)
-    return (POLICIES[config.policy] if whole else AblatedPolicy)(config)
-
-
-SHORT = {"horizon": 4, "n_action_steps": 3}
-FLOW, FREQ = SHORT | {"sampler": "ddim"}, {"sampler": "ddim"}  # theirs: there is no choice
-# What each changes against DAMI's preset of the same name. `paper`: as the published code is run;
-# `small`: about 3 million parameters, as many as DAMI's.
+# The configurations by policy and preset. `paper`: as the published code is run; `small`: about
+# 3 million parameters, as many as DAMI's.
 # fmt: off
-CHANGES = {
-    "dami": {"paper": {}, "small": {}, "tiny": {}},
-    "dp3": {"paper": {}, "small": {"unet_widths": (48, 96, 192)}, "tiny": {}},
-    "flow": {"paper": FLOW, "small": FLOW | {"unet_widths": (48, 96, 192)}, "tiny": FLOW},
+PRESETS = {
+    "dami": model.PRESETS,
+    "dp3": {
+        "paper": changed("paper", policy="dp3"),
+        "small": changed("small", policy="dp3", unet_widths=(48, 96, 192)),
+        "tiny": changed("tiny", policy="dp3"),
+    },
+    "flow": {
+        "paper": changed("paper", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
+        "small": changed(
+            "small", policy="flow", sampler="ddim", horizon=4, n_action_steps=3,
+            unet_widths=(48, 96, 192),
+        ),
+        "tiny": changed("tiny", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
+    },
     "mamba": {
-        "paper": SHORT | {"unet_widths": (128, 256, 512)},
-        "small": SHORT | {"unet_widths": (32, 64, 112)},
-        "tiny": SHORT,
+        "paper": changed(
+            "paper", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3,
+            unet_widths=(128, 256, 512),
+        ),
+        "small": changed(
+            "small", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3,
+            unet_widths=(32, 64, 112),
+        ),
+        "tiny": changed(
+            "tiny", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3
+        ),
     },
     "freq": {
-        "paper": FREQ | {"unet_widths": (512, 1024)},
-        "small": FREQ | {"unet_widths": (128, 256)},
-        "tiny": FREQ | {"unet_widths": (32, 64)},
+        "paper": changed(
+            "paper", policy="freq", denoiser="frequency-transformer", sampler="ddim",
+            unet_widths=(512, 1024),
+        ),
+        "small": changed(
+            "small", policy="freq", denoiser="frequency-transformer", sampler="ddim",
+            unet_widths=(128, 256),
+        ),
+        "tiny": changed(
+            "tiny", policy="freq", denoiser="frequency-transformer", sampler="ddim",
+            unet_widths=(32, 64),
+        ),
     },
 }
 # fmt: on
-READS = {"demo_encoder": "none", "tcfm": "none"}  # no task, but for DAMI
-
-
-def preset(policy: str, name: str) -> PolicyConfig:
-    """The configuration of a policy in a preset."""
-    reads = {} if policy == "dami" else READS
-    return replace(model.PRESETS[name], policy=policy, **reads, **CHANGES[policy][name])
-
-
-PRESETS = {p: {name: preset(p, name) for name in model.PRESETS} for p in CHANGES}
 
 
 def main() -> None:
     """Prints the size of each policy and preset."""
     argparse.ArgumentParser(description=main.__doc__).parse_args()
     print(f"{'parameters':<10} " + " ".join(f"{preset:>13}" for preset in model.PRESETS))
-    for policy, presets in PRESETS.items():
-        with torch.device("meta"):  # weights are neither drawn nor stored
-            built = [build_policy(config) for config in presets.values()]
-        sizes = [sum(p.numel() for p in one.parameters()) for one in built]
-        print(f"{policy:<10} " + " ".join(f"{size:>13,}" for size in sizes))
+    for name, presets in PRESETS.items():
+        sizes = []
+        for config in presets.values():
+            with torch.device("meta"):  # weights are neither drawn nor stored
+                policy = build_policy(config)
+            sizes.append(sum(p.numel() for p in policy.parameters()))
+        print(f"{name:<10} " + " ".join(f"{size:>13,}" for size in sizes))
 
 
 if __name__ == "__main__":

@@ -138,7 +138,7 @@ def adapt_checkpoint(
     scripts.rewind_metrics(folder, 0)
     evaluate.judge(folder, 0, policy, *judged_by)
     if settings.normalizer == "fit":
-        policy.normalizer.fit(sampler.points, sampler.state, sampler.action)  # line 3
+        policy.normalizer.fit([sampler])  # line 3
 
     # The paper's rates belong to a meta-training at 1e-4; for another they keep their proportion.
     scale = trained["lr"] / PAPER_LEARNING_RATE

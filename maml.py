@@ -18,12 +18,15 @@ function `loss_fn(params, batch) -> scalar tensor`; with a `torch.nn.Module` tha
 """
 
 from collections.abc import Callable, Iterable
+from inspect import signature
 from itertools import islice
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.func import grad, grad_and_value
+from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_map
 
 Params = dict[str, Tensor]
@@ -43,8 +46,8 @@ def adapt(
         batch: anything `loss_fn` understands, usually the support set of a task.
         lr: the inner learning rate alpha.
         steps: gradient steps, all on the same batch.
-        first_order: the inner gradient counts as a constant, so that who differentiates the result
-            sees d theta' / d theta = 1. Cheaper, and a different gradient.
+        first_order: first-order MAML: the inner gradient is treated as a constant. It is cheaper,
+            and it gives a different meta-gradient.
     """
     for _ in range(steps):
         start = {name: p.detach() for name, p in params.items()} if first_order else params
@@ -69,12 +72,17 @@ def meta_gradient(
         loss_fn, params, lr, steps, first_order: as in `adapt`.
         tasks: (support, query) batches, one pair a task. An iterator is read `vectorize` tasks at a
             time, and their graph is freed before the next are read: memory does not grow.
-        vectorize: so many tasks run at once, under `torch.vmap`: the same numbers, up to twice as
-            fast. Their batches must have equal shapes and hold tensors only.
+        vectorize: how many tasks run at once, under `torch.vmap`. The numbers are the same, and it
+            is up to twice as fast. The batches must have equal shapes and hold tensors only.
 
     Returns:
         (gradients, after, before): name -> tensor, and the query losses with the adapted parameters
-        and with the given ones, both (tasks,). Raises ValueError without a task, or `vectorize`.
+        and with the given ones, both (tasks,).
+
+    Raises:
+        ValueError: there is no task, or `vectorize` is less than 1.
+        NotImplementedError: with `vectorize` > 1, `loss_fn` calls what PyTorch differentiates
+            wrongly under `vmap`; see the end of this file.
     """
     if vectorize < 1:
         raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
@@ -92,7 +100,8 @@ def meta_gradient(
             losses = query_losses(params, *chunk[0])[None]
         else:
             support, query = tree_map(lambda *parts: torch.stack(parts), *chunk)
-            losses = torch.vmap(query_losses, in_dims=(None, 0, 0))(params, support, query)
+            with RightUnderVmap():
+                losses = torch.vmap(query_losses, in_dims=(None, 0, 0))(params, support, query)
         return losses[:, 0].sum(), losses  # (tasks, 2)
 
     tasks, total, losses = iter(tasks), None, []
@@ -107,3 +116,61 @@ def meta_gradient(
         raise ValueError("meta_gradient needs at least one task")
     after, before = torch.cat(losses).unbind(dim=1)
     return {name: g / len(after) for name, g in total.items()}, after, before
+
+
+# ---- Where PyTorch is wrong under vmap: skip this when reading the method ------------------------
+#
+# Under `torch.vmap` every task has adapted weights of its own. With such weights PyTorch (2.13)
+# returns a wrong second derivative of layer, batch and instance normalization, and wrong
+# derivatives of an embedding with `padding_idx` or `scale_grad_by_freq`, and raises no error. The
+# other layers of torch.nn were compared one by one: they give the same numbers with and without
+# `vmap`, or raise an error. tests/test_maml.py repeats the comparison.
+
+NORMALIZATIONS = {F.layer_norm, F.batch_norm, F.instance_norm}  # what the layers of torch.nn call
+REFUSED = {  # what those call themselves, in case a loss calls it directly
+    torch.layer_norm,
+    torch.native_layer_norm,
+    torch.batch_norm,
+    torch.native_batch_norm,
+    torch.instance_norm,
+    torch.embedding,
+}
+
+
+class RightUnderVmap(TorchFunctionMode):
+    """Inside this context normalization has its right derivatives, and an embedding, or an error.
+
+    NotImplementedError is raised where the derivatives would be wrong.
+    """
+
+    def __torch_function__(
+        self, func: Callable, types: Any, args: tuple = (), kwargs: dict | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func in NORMALIZATIONS:
+            return normalize_then_scale(func, *args, **kwargs)
+        if func is F.embedding:
+            options = signature(func).bind(*args, **kwargs).arguments
+            refused = options.get("padding_idx") is not None or options.get("scale_grad_by_freq")
+        else:
+            refused = func in REFUSED
+        if refused:
+            raise NotImplementedError(
+                f"PyTorch's derivatives of {func.__name__}, called like this, are wrong under "
+                "torch.vmap: use vectorize=1, or a layer of torch.nn without padding_idx and "
+                "scale_grad_by_freq"
+            )
+        return func(*args, **kwargs)
+
+
+def normalize_then_scale(function: Callable, *args: Any, **kwargs: Any) -> Tensor:
+    """One of `NORMALIZATIONS`, its weight and bias applied outside it: so it has no such error."""
+    options = signature(function).bind(*args, **kwargs).arguments
+    weight, bias = options.pop("weight", None), options.pop("bias", None)
+    x = function(**options)  # layer_norm: (..., *weight.shape); the others: (B, channels, ...)
+    if function is not F.layer_norm:
+        per_channel = (-1, *[1] * (x.dim() - 2))
+        weight = None if weight is None else weight.view(per_channel)  # (channels, 1, ...)
+        bias = None if bias is None else bias.view(per_channel)
+    x = x if weight is None else x * weight
+    return x if bias is None else x + bias

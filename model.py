@@ -14,17 +14,23 @@ The file reads from small blocks to `DAMIPolicy` and imports nothing of the proj
 section, PyTorch's layers written out for speed, can be skipped.
 
 Letters: B windows, G windows that share one demonstration, D demonstrations (B = D * G), T frames
-of a demonstration, N points (W winning ones), To = 2 observations (the older first), H = 16
-horizon, Ta = 8 executed actions, A action dim, S state dim, K = 100 diffusion steps, C condition
-width (timestep_dim + To * observation feature), L length of the action sequence inside the U-Net
-(H, then half of it a level). Clouds and poses are in metres; networks see [-1, 1].
+of a demonstration, N points (M critical ones), P = 3 numbers of a point, To = 2 observations (the
+older first), H = 16 horizon, Ta = 8 executed actions, A action dim, S state dim, K = 100 diffusion
+steps, C condition width (timestep_dim + To * observation feature), L length of the action sequence
+inside the U-Net (H, then half of it a level). The first three numbers of a point are its position;
+others are features such as colours in [0, 1], and there are none by default. Positions and poses
+are in metres; networks see [-1, 1].
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -34,10 +40,6 @@ from torch.optim.swa_utils import AveragedModel
 # ---- Configuration -------------------------------------------------------------------------------
 
 
-CHOICES = {"demo_encoder": ("vmt", "mlp", "none"), "tcfm": ("down", "mid", "up", "none")}
-CHOICES |= {"policy": ("dami", "dp3", "flow", "mamba", "freq"), "sampler": ("ddim", "dp3")}
-
-
 @dataclass(frozen=True)
 class PolicyConfig:
     """The whole architecture, from which a checkpoint's policy is rebuilt.
@@ -45,27 +47,29 @@ class PolicyConfig:
     The defaults are the paper's; what it leaves out (PointNet, the U-Net's widths) is DP3's.
     """
 
-    policy: str = "dami"  # dami | dp3 | flow | mamba | freq, see baselines.py
+    policy: str = "dami"  # dami | dp3, and of baselines.py flow | mamba | freq; see `POLICIES`
     state_dim: int = 9  # S: end effector, right finger, left finger, metres
     action_dim: int = 4  # A: dx, dy, dz, gripper
     num_points: int = 512  # N
+    point_dim: int = 3  # P: a position, and features such as colours in [0, 1]
     horizon: int = 16  # H, the actions of a window
     n_obs_steps: int = 2  # To
     n_action_steps: int = 8  # Ta, executed before the policy looks again
     pointnet_widths: tuple[int, ...] = (64, 128, 256)
     point_feature_dim: int = 64
     state_feature_dim: int = 64
-    demo_encoder: str = "vmt"  # vmt | mlp (baselines.py) | none
+    demo_encoder: str = "vmt"  # vmt | none, and of baselines.py mlp; see `demo_encoders`
     demo_stride: int = 1  # the demonstration encoder reads every demo_stride-th frame
     demo_positions: int = 200  # learned positions: the longest demonstration, after the stride
     demo_dim: int = 128  # the table calls it "Action Dim"
     vmt_layers: int = 2
     vmt_heads: int = 4
-    tcfm: str = "down"  # which U-Net level reads U2T's output: down | mid | up | none
+    tcfm: str = "down"  # which level of the denoiser reads U2T's output: down | mid | up | none
     u2t_layers: int = 1
     u2t_heads: int = 8
     text_dim: int = 512
     timestep_dim: int = 128
+    denoiser: str = "unet"  # of baselines.py mamba-unet | frequency-transformer; see `denoisers`
     unet_widths: tuple[int, ...] = (512, 1024, 2048)
     kernel_size: int = 5
     n_groups: int = 8
@@ -74,35 +78,64 @@ class PolicyConfig:
     sampler: str = "dp3"  # ddim | dp3, see DiffusionSchedule.step
 
     def __post_init__(self):
-        # A checkpoint brings lists back where tuples went in.
+        # JSON brings lists back where tuples went in.
         object.__setattr__(self, "pointnet_widths", tuple(self.pointnet_widths))
         object.__setattr__(self, "unet_widths", tuple(self.unet_widths))
+        self.check_fields()
+        self.check_relations()
 
-        layers = self.vmt_layers + self.u2t_layers
-        if () in (self.pointnet_widths, self.unet_widths) or layers > 99 or self.timestep_dim < 4:
-            raise ValueError("networks need widths, timestep_dim >= 4, VMT and U2T <= 99 layers")
+    def check_fields(self) -> None:
+        """Raises ValueError for a field whose value no policy can have."""
+        for name, known in choices().items():
+            value = getattr(self, name)
+            if value not in known:
+                raise ValueError(f"{name} is {value!r}; use one of {', '.join(known)}")
         for name, value in vars(self).items():
             if isinstance(value, int) and not 1 <= value <= 100_000:
                 raise ValueError(f"{name} is {value}: use at least 1, at most 100000")
-        for name, known in CHOICES.items():
-            if (value := getattr(self, name)) not in known:
-                raise ValueError(f"{name} is {value!r}; use one of {', '.join(known)}")
+        for name in ("pointnet_widths", "unet_widths"):
+            widths = getattr(self, name)
+            if not widths or min(widths) < 1:
+                raise ValueError(f"{name} is {widths}: use one width or more, each at least 1")
+        for name in ("vmt_layers", "u2t_layers"):
+            if getattr(self, name) > 99:
+                raise ValueError(f"{name} is {getattr(self, name)}: use at most 99")
+        if self.point_dim < 3:
+            raise ValueError(f"point_dim is {self.point_dim}: a position alone has 3 numbers")
+        if self.timestep_dim < 4 or self.timestep_dim % 2:
+            raise ValueError(f"timestep_dim is {self.timestep_dim}: use an even one, at least 4")
+        if self.kernel_size % 2 == 0:
+            raise ValueError(f"kernel_size is {self.kernel_size}: use an odd one")
 
+    def check_relations(self) -> None:
+        """Raises ValueError, which names both, for two fields that contradict each other."""
         H, To, Ta = self.horizon, self.n_obs_steps, self.n_action_steps
-        if Ta > (most := H - To + 1):
+        most = H - To + 1
+        if Ta > most:
             raise ValueError(f"n_action_steps {Ta}: horizon {H} has {most} after observation {To}")
-        shrink = 2 ** (len(self.unet_widths) - 1)  # the U-Net halves the sequence between levels
-        for whole, part, what in [
-            (self.horizon, shrink, "horizon by 2 for each level of the U-Net but the last"),
-            (self.diffusion_steps, self.inference_steps, "diffusion_steps by inference_steps"),
-            (self.kernel_size + 1, 2, "kernel_size + 1 by 2 (use an odd one)"),
-            (self.timestep_dim, 2, "timestep_dim by 2"),
-            (self.demo_dim, self.vmt_heads, "demo_dim by vmt_heads"),
-            (self.condition_dim, self.u2t_heads, "condition width by u2t_heads"),
-            (math.gcd(*self.unet_widths), self.n_groups, "U-Net widths by n_groups"),
-        ]:
-            if whole % part:
-                raise ValueError(f"cannot divide {what}: {whole} by {part}")
+        halvings = len(self.unet_widths) - 1
+        if H % 2**halvings:
+            raise ValueError(
+                f"horizon {H} cannot be halved {halvings} times, as between the "
+                f"{halvings + 1} levels of unet_widths: use a multiple of {2**halvings}"
+            )
+        if self.diffusion_steps % self.inference_steps:
+            raise ValueError(
+                f"diffusion_steps {self.diffusion_steps} is no multiple of "
+                f"inference_steps {self.inference_steps}"
+            )
+        if self.demo_dim % self.vmt_heads:
+            raise ValueError(
+                f"demo_dim {self.demo_dim} is no multiple of vmt_heads {self.vmt_heads}"
+            )
+        if self.condition_dim % self.u2t_heads:
+            raise ValueError(
+                f"the condition's width {self.condition_dim} (timestep_dim and To observation "
+                f"features) is no multiple of u2t_heads {self.u2t_heads}"
+            )
+        for width in self.unet_widths:
+            if width % self.n_groups:
+                raise ValueError(f"unet_widths {width} is no multiple of n_groups {self.n_groups}")
 
     @property
     def observation_feature_dim(self) -> int:
@@ -119,23 +152,6 @@ class PolicyConfig:
         return self.demo_encoder != "none" or self.tcfm != "none"
 
 
-# `small` is for two CPU cores, `tiny` to see everything run. What is not named here is the paper's.
-# fmt: off
-PRESETS = {
-    "paper": PolicyConfig(),
-    "small": PolicyConfig(
-        num_points=128, pointnet_widths=(32, 64, 128), state_feature_dim=32, timestep_dim=64,
-        demo_stride=16, demo_positions=13,  # 13 of a demonstration's 200 frames
-        unet_widths=(32, 64, 128), n_action_steps=4, inference_steps=5,
-    ),
-    "tiny": PolicyConfig(
-        num_points=64, pointnet_widths=(16, 32), point_feature_dim=16, state_feature_dim=16,
-        demo_stride=20, demo_positions=10, demo_dim=32, timestep_dim=32, unet_widths=(16, 32),
-    ),
-}
-# fmt: on
-
-
 # ---- Attention: one block for VMT and U2T --------------------------------------------------------
 
 
@@ -144,6 +160,8 @@ class Attention(nn.Module):
 
     def __init__(self, width: int, heads: int):
         super().__init__()
+        if width % heads:
+            raise ValueError(f"an attention of width {width} cannot have {heads} heads")
         self.heads = heads
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
@@ -187,24 +205,28 @@ class TransformerBlock(nn.Module):
 class PointNetEncoder(nn.Module):
     """A cloud to one feature: the same MLP on every point, the maximum over points, a projection.
 
-    The maximum makes it blind to the order of the points. It passes no gradient to a point that
-    wins in no channel, so that only winners are differentiated (`WinningPoints`): a third of them.
+    The maximum makes it blind to the order of the points. A point that has the maximum in no
+    channel gets no gradient. Only the others, PointNet's critical points, are therefore
+    differentiated (`CriticalPoints`): about a third of all.
     """
 
-    def __init__(self, widths: tuple[int, ...] = (64, 128, 256), feature_dim: int = 64):
+    def __init__(
+        self, widths: tuple[int, ...] = (64, 128, 256), feature_dim: int = 64, point_dim: int = 3
+    ):
         super().__init__()
         layers = []
-        for d_in, d_out in pairwise((3, *widths)):
+        for d_in, d_out in pairwise((point_dim, *widths)):
             layers += [nn.Linear(d_in, d_out), LayerNorm(d_out), nn.ReLU()]
         self.mlp = nn.Sequential(*layers)
         self.projection = nn.Sequential(nn.Linear(widths[-1], feature_dim), LayerNorm(feature_dim))
 
     def forward(self, points: Tensor) -> Tensor:
-        """(..., N, 3) float, normalized -> (..., feature_dim)."""
+        """(..., N, P) float, normalized -> (..., feature_dim)."""
         if torch.is_grad_enabled():
-            winners = WinningPoints.apply(points, *self.mlp.parameters())  # (..., W) indices
-            points = points.gather(-2, winners[..., None].expand(*winners.shape, 3))  # (..., W, 3)
-        x = self.mlp(points)  # (..., N, widths[-1]), or W for N
+            critical = CriticalPoints.apply(points, *self.mlp.parameters())  # (..., M) indices
+            rows = critical[..., None].expand(*critical.shape, points.shape[-1])  # (..., M, P)
+            points = points.gather(-2, rows)  # (..., M, P)
+        x = self.mlp(points)  # (..., N, widths[-1]), or M for N
         return self.projection(x.amax(dim=-2))  # (..., feature_dim)
 
 
@@ -213,12 +235,14 @@ class ObservationEncoder(nn.Module):
 
     def __init__(self, config: PolicyConfig):
         super().__init__()
-        self.pointnet = PointNetEncoder(config.pointnet_widths, config.point_feature_dim)
+        self.pointnet = PointNetEncoder(
+            config.pointnet_widths, config.point_feature_dim, config.point_dim
+        )
         S, width = config.state_dim, config.state_feature_dim
         self.state_mlp = nn.Sequential(nn.Linear(S, width), nn.ReLU(), nn.Linear(width, width))
 
     def forward(self, points: Tensor, state: Tensor) -> Tensor:
-        """points (..., N, 3), state (..., S), normalized -> (..., observation_feature_dim)."""
+        """points (..., N, P), state (..., S), normalized -> (..., observation_feature_dim)."""
         return torch.cat([self.pointnet(points), self.state_mlp(state)], dim=-1)
 
 
@@ -243,6 +267,11 @@ class VisualMotorTrajectory(nn.Module):
         for block in self.blocks:
             x = block(x)  # Eq. 5
         return x
+
+
+# What makes the tokens of a demonstration, by `PolicyConfig.demo_encoder`: built of a
+# configuration, and called as VisualMotorTrajectory is, with any number of tokens instead of T.
+demo_encoders: dict[str, type[nn.Module]] = {"vmt": VisualMotorTrajectory}
 
 
 class UnpairedUnifiedTask(nn.Module):
@@ -310,7 +339,59 @@ class UnpairedUnifiedTask(nn.Module):
         return x.flatten(0, 1)  # (B, C)   Eq. 8
 
 
-# ---- The denoiser --------------------------------------------------------------------------------
+class PooledTask(nn.Module):
+    """What stands in for U2T in the ablation's rows without TCFM, "Baseline" (mlp) and "+ VMT".
+
+    The paper does not say how a demonstration enters there. Here its tokens, averaged over time,
+    and the instruction go through one linear layer and are added to h_k, for every level.
+    """
+
+    def __init__(self, config: PolicyConfig):
+        super().__init__()
+        self.projection = nn.Linear(config.demo_dim + config.text_dim, config.condition_dim)
+
+    def encode_context(self, demo_tokens: Tensor, text: Tensor) -> tuple[Tensor, ...]:
+        """demo_tokens (D, T, demo_dim), text (D, text_dim) -> ((D, C),)."""
+        return (self.projection(torch.cat([demo_tokens.mean(dim=1), text], dim=-1)),)
+
+    def forward(self, h: Tensor, context: tuple[Tensor, ...]) -> Tensor:
+        """h_k (B, C) and the context of D = B / G tasks -> (B, C)."""
+        return h + context[0].repeat_interleave(len(h) // len(context[0]), dim=0)
+
+
+# ---- h_k, and the denoiser that it modulates -----------------------------------------------------
+
+
+def sinusoids(timesteps: Tensor, dim: int) -> Tensor:
+    """(...) int64 -> (..., dim): sines, then cosines, of geometrically falling rates."""
+    half = dim // 2
+    exponents = torch.arange(half, device=timesteps.device) * (-math.log(10000) / (half - 1))
+    angles = timesteps[..., None] * exponents.exp()  # (..., dim / 2)
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+class ConditionEncoder(nn.Module):
+    """h_k = MLP([embedding of the diffusion timestep, observation features])   (Eq. 7).
+
+    DP3 has no such MLP: where no task is read, h_k is the concatenation itself.
+    """
+
+    def __init__(self, config: PolicyConfig):
+        super().__init__()
+        self.timestep_dim = config.timestep_dim
+        width, C = config.timestep_dim, config.condition_dim
+        self.timestep_mlp = nn.Sequential(
+            nn.Linear(width, 4 * width), Mish(), nn.Linear(4 * width, width)
+        )
+        # Made in any case: the weights that follow then have the same random numbers as DAMI's.
+        condition_mlp = nn.Sequential(nn.Linear(C, C), Mish(), nn.Linear(C, C))
+        self.condition_mlp = condition_mlp if config.reads_task else nn.Identity()
+
+    def forward(self, timesteps: Tensor, observation: Tensor) -> Tensor:
+        """timesteps (B,) int64, observation (B, To * feature) -> h_k (B, C)."""
+        embedding = sinusoids(timesteps, self.timestep_dim)  # (B, timestep_dim)
+        embedding = self.timestep_mlp(embedding.to(observation.dtype))
+        return self.condition_mlp(torch.cat([embedding, observation], dim=-1))
 
 
 class ConvBlock(nn.Sequential):
@@ -336,78 +417,65 @@ class ResidualBlock(nn.Module):
         return self.conv2(scale * self.conv1(x) + bias) + self.residual(x)
 
 
-def sinusoids(timesteps: Tensor, dim: int) -> Tensor:
-    """(...) int64 -> (..., dim): sines, then cosines, of geometrically falling rates."""
-    half = dim // 2
-    exponents = torch.arange(half, device=timesteps.device) * (-math.log(10000) / (half - 1))
-    angles = timesteps[..., None] * exponents.exp()  # (..., dim / 2)
-    return torch.cat([angles.sin(), angles.cos()], dim=-1)
-
-
 class ConditionalUNet1d(nn.Module):
     """DP3's 1D U-Net over time, with task-conditioned feature modulation (TCFM).
 
-    Every residual block is modulated by h_k = MLP([timestep embedding, observation features])
-    (Eq. 7), but for the two blocks of the level that `tcfm` names, which take U2T's output (Eq.
-    10): the first down-sampling level (`down`, the paper's), the middle (`mid`) or the last
-    up-sampling level (`up`). DP3 has no MLP: there h_k is the concatenation itself.
+    Every residual block is modulated by h_k, but for the two blocks of the level that `tcfm` names,
+    which take U2T's output (Eq. 10): the first down-sampling level (`down`, the paper's), the
+    middle (`mid`) or the last up-sampling level (`up`).
     """
 
     def __init__(self, config: PolicyConfig):
         super().__init__()
         self.tcfm = config.tcfm
-        self.timestep_dim = config.timestep_dim
-        width = config.timestep_dim
-        wide, c = 4 * width, config.condition_dim
-        self.timestep_mlp = nn.Sequential(nn.Linear(width, wide), Mish(), nn.Linear(wide, width))
-        mlp = nn.Sequential(nn.Linear(c, c), Mish(), nn.Linear(c, c))
-        self.condition_mlp = mlp if config.reads_task else nn.Identity()
-
         widths = config.unet_widths
         self.down = nn.ModuleList()
         for level, (d_in, d_out) in enumerate(pairwise((config.action_dim, *widths))):
-            last = level == len(widths) - 1
-            shrink = nn.Identity() if last else nn.Conv1d(d_out, d_out, 3, stride=2, padding=1)
-            blocks = [ResidualBlock(d_in, d_out, config), ResidualBlock(d_out, d_out, config)]
-            self.down.append(nn.ModuleList([*blocks, shrink]))
+            if level < len(widths) - 1:
+                downsample = nn.Conv1d(d_out, d_out, 3, stride=2, padding=1)
+            else:
+                downsample = nn.Identity()
+            block1 = ResidualBlock(d_in, d_out, config)
+            block2 = ResidualBlock(d_out, d_out, config)
+            self.down.append(nn.ModuleList([block1, block2, downsample]))
 
         self.mid = nn.ModuleList(ResidualBlock(widths[-1], widths[-1], config) for _ in range(2))
         self.up = nn.ModuleList()
         for d_out, d_in in pairwise(reversed(widths)):
             # d_out channels come up from below, and d_out from the skip connection
-            blocks = [ResidualBlock(2 * d_out, d_in, config), ResidualBlock(d_in, d_in, config)]
-            grow = nn.ConvTranspose1d(d_in, d_in, 4, stride=2, padding=1)
-            self.up.append(nn.ModuleList([*blocks, grow]))
+            block1 = ResidualBlock(2 * d_out, d_in, config)
+            block2 = ResidualBlock(d_in, d_in, config)
+            upsample = nn.ConvTranspose1d(d_in, d_in, 4, stride=2, padding=1)
+            self.up.append(nn.ModuleList([block1, block2, upsample]))
         self.head = nn.Sequential(
             ConvBlock(widths[0], widths[0], config.kernel_size, config.n_groups),
             nn.Conv1d(widths[0], config.action_dim, 1),
         )
 
-    def condition(self, timesteps: Tensor, observation: Tensor) -> Tensor:
-        """h_k: timesteps (B,) int64, observation (B, To * feature) -> (B, C)   (Eq. 7)."""
-        embedding = sinusoids(timesteps, self.timestep_dim)  # (B, timestep_dim)
-        embedding = self.timestep_mlp(embedding.to(observation.dtype))
-        return self.condition_mlp(torch.cat([embedding, observation], dim=-1))
-
     def forward(self, actions: Tensor, h: Tensor, fused: Tensor | None = None) -> Tensor:
         """Noisy actions (B, H, A), h_k (B, C), U2T's output (B, C) -> clean actions (B, H, A)."""
-        conditions = {level: h for level in ("down", "mid", "up")}
+        conditions = {"down": h, "mid": h, "up": h}
         if fused is not None:
             conditions[self.tcfm] = fused  # Eq. 10
         x = actions.transpose(1, 2)  # (B, A, H)
         skips = []
-        for level, (block1, block2, shrink) in enumerate(self.down):
+        for level, (block1, block2, downsample) in enumerate(self.down):
             c = conditions["down"] if level == 0 else h
             x = block2(block1(x, c), c)  # (B, width, L)
             skips.append(x)
-            x = shrink(x)  # (B, width, L / 2), but for the last level
+            x = downsample(x)  # (B, width, L / 2), but for the last level
         for block in self.mid:
             x = block(x, conditions["mid"])
-        for level, (block1, block2, grow) in enumerate(self.up):
+        for level, (block1, block2, upsample) in enumerate(self.up):
             c = conditions["up"] if level == len(self.up) - 1 else h
             x = torch.cat([x, skips.pop()], dim=1)  # (B, 2 width, L)
-            x = grow(block2(block1(x, c), c))  # (B, width above, 2 L)
+            x = upsample(block2(block1(x, c), c))  # (B, width above, 2 L)
         return self.head(x).transpose(1, 2)  # (B, H, A)
+
+
+# The networks by `PolicyConfig.denoiser`: built of a configuration, and called as ConditionalUNet1d
+# is, with `fused` only where the configuration reads a task. Another network is a class and a line.
+denoisers: dict[str, type[nn.Module]] = {"unet": ConditionalUNet1d}
 
 
 # ---- Diffusion and normalization -----------------------------------------------------------------
@@ -455,28 +523,43 @@ class DiffusionSchedule(nn.Module):
         return a_next.sqrt() * prediction.clamp(-1, 1) + (1 - a_next).sqrt() * noise
 
 
-class Normalizer(nn.Module):
-    """Maps points, state and action to [-1, 1], each coordinate by its range in the data."""
+class Recording(Protocol):
+    """What a normalizer is fitted to, for example a `data.WindowSampler`."""
 
-    def __init__(self, state_dim: int, action_dim: int):
+    points: Tensor  # (..., P)
+    state: Tensor  # (..., S)
+    action: Tensor  # (..., A)
+
+
+class Normalizer(nn.Module):
+    """Maps points, state and action to [-1, 1], each coordinate by its range in the data.
+
+    Of a point that is its position. Features of points, such as colours in [0, 1], pass unchanged.
+    """
+
+    def __init__(self, state_dim: int, action_dim: int, point_dim: int = 3):
         super().__init__()
-        for name, dim in {"points": 3, "state": state_dim, "action": action_dim}.items():
+        for name, dim in {"points": point_dim, "state": state_dim, "action": action_dim}.items():
             self.register_buffer(f"{name}_center", torch.zeros(dim))
             self.register_buffer(f"{name}_scale", torch.ones(dim))
 
-    def fit(self, points: Tensor, state: Tensor, action: Tensor) -> None:
-        """Sets the ranges from data: points (..., 3), state (..., S), action (..., A).
+    def fit(self, recordings: Iterable[Recording]) -> None:
+        """Sets the ranges to those of all recordings together.
 
         A coordinate that hardly moves (range under 1e-4) is centred and not stretched; of an action
         it is, since what is drawn from [-1, 1] must come back as what the demonstrations did.
         """
-        for name, data in {"points": points, "state": state, "action": action}.items():
-            data = data.flatten(0, -2).float()
-            low, high = data.amin(0), data.amax(0)
-            half = (high - low) / 2
-            getattr(self, f"{name}_center").copy_((low + high) / 2)
-            constant = 5e-5 if name == "action" else 1.0
-            getattr(self, f"{name}_scale").copy_(torch.where(half < 5e-5, constant, half))
+        recordings = list(recordings)
+        for name in ("points", "state", "action"):
+            tensors = [getattr(recording, name).flatten(0, -2) for recording in recordings]
+            low = torch.stack([x.amin(0) for x in tensors]).amin(0).float()  # (dim,)
+            high = torch.stack([x.amax(0) for x in tensors]).amax(0).float()
+            center, half = (low + high) / 2, (high - low) / 2
+            scale = torch.where(half < 5e-5, 5e-5 if name == "action" else 1.0, half)
+            if name == "points":
+                center[3:], scale[3:] = 0.0, 1.0
+            getattr(self, f"{name}_center").copy_(center)
+            getattr(self, f"{name}_scale").copy_(scale)
 
     def normalize(self, name: str, x: Tensor) -> Tensor:
         """x (..., dim) in its own unit -> [-1, 1]; `name` is points, state or action."""
@@ -487,42 +570,100 @@ class Normalizer(nn.Module):
         return x * getattr(self, f"{name}_scale") + getattr(self, f"{name}_center")
 
 
+# ---- Batches -------------------------------------------------------------------------------------
+
+# What a batch says of its task. Every other entry has one row for each window.
+TASK_INPUTS = ("text", "demo_points", "demo_state", "demo_action")
+
+
+def split(batch: dict[str, Tensor], n: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Splits a task's windows by index: the first n for support, the others for query.
+
+    `batch` holds the arguments of `DAMIPolicy.loss`. Both parts keep the whole of what says the
+    task, `TASK_INPUTS`.
+    """
+    support, query = {}, {}
+    for name, x in batch.items():
+        support[name] = x if name in TASK_INPUTS else x[:n]
+        query[name] = x if name in TASK_INPUTS else x[n:]
+    return support, query
+
+
 # ---- The policy, and its moving average ----------------------------------------------------------
 
 Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None: no task is read
 
 
 class DAMIPolicy(nn.Module):
-    """The policy: two observations, an instruction and a demonstration in; actions out."""
+    """The policy: two observations, an instruction and a demonstration in; actions out.
 
-    demo_encoders: ClassVar = {"vmt": VisualMotorTrajectory}  # baselines.py exchanges both
-    network = ConditionalUNet1d
+    Raises ValueError for a configuration of another policy, or one that this class cannot have.
+    """
+
+    # What a subclass may say otherwise:
+    requires: ClassVar[dict[str, str]] = {}  # fields of its configuration that have one value
+    conditioned_by_h: ClassVar[bool] = True  # whether its denoiser is modulated by h_k
 
     def __init__(self, config: PolicyConfig):
         super().__init__()
         self.config = config
-        self.normalizer = Normalizer(config.state_dim, config.action_dim)
+        self.check_config()
+        self.normalizer = Normalizer(config.state_dim, config.action_dim, config.point_dim)
         self.observation_encoder = ObservationEncoder(config)
         if config.demo_encoder != "none":
-            self.demo_encoder = self.demo_encoders[config.demo_encoder](config)
+            self.demo_encoder = demo_encoders[config.demo_encoder](config)
         if config.tcfm != "none":
             self.u2t = UnpairedUnifiedTask(config)
-        self.unet = self.network(config)
-        steps = config.diffusion_steps, config.inference_steps
-        self.schedule = DiffusionSchedule(*steps, config.sampler)
+        if self.conditioned_by_h:
+            self.condition_encoder = ConditionEncoder(config)
+        self.denoiser = denoisers[config.denoiser](config)
+        if config.tcfm == "none" and config.reads_task:  # an ablation
+            self.u2t = PooledTask(config)
+        self.schedule = DiffusionSchedule(
+            config.diffusion_steps, config.inference_steps, config.sampler
+        )
+
+    def check_config(self) -> None:
+        """Raises ValueError for a configuration that names another class, or does not fit this."""
+        config, name = self.config, self.config.policy
+        if POLICIES[name] is not type(self):
+            raise ValueError(
+                f"policy {name!r} is a {POLICIES[name].__name__} and no {type(self).__name__}: "
+                "use build_policy, or name this class in model.POLICIES"
+            )
+        if config.reads_task and not self.reads_task:
+            raise ValueError(f"{name} reads no task: use demo_encoder none and tcfm none")
+        for field, value in self.requires.items():
+            if getattr(config, field) != value:
+                raise ValueError(f"{name} needs {field} {value}, not {getattr(config, field)}")
+
+    @property
+    def reads_task(self) -> bool:
+        """Whether an instruction or a demonstration names the task."""
+        return self.config.reads_task
+
+    @property
+    def reads_demonstration(self) -> bool:
+        return self.config.demo_encoder != "none"
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The parameters by adaptation learning rate: `vision`, `diffusion`, `other` (VMT, U2T)."""
         groups = {"vision": [], "diffusion": [], "other": []}
-        place = {"observation_encoder": "vision", "unet": "diffusion"}
+        group_of = {
+            "observation_encoder": "vision",
+            "condition_encoder": "diffusion",
+            "denoiser": "diffusion",
+        }
         for name, parameter in self.named_parameters():
-            groups[place.get(name.split(".")[0], "other")].append(parameter)
+            part = name.split(".")[0]
+            groups[group_of.get(part, "other")].append(parameter)
         return groups
 
     def encode_observations(self, points: Tensor, state: Tensor) -> Tensor:
-        """points (..., N, 3) in metres, state (..., S) -> (..., observation_feature_dim)."""
-        normalize = self.normalizer.normalize
-        return self.observation_encoder(normalize("points", points), normalize("state", state))
+        """points (..., N, P), positions in metres, state (..., S) -> (..., feature)."""
+        points = self.normalizer.normalize("points", points)
+        state = self.normalizer.normalize("state", state)
+        return self.observation_encoder(points, state)  # (..., observation_feature_dim)
 
     def encode_demo(
         self,
@@ -533,32 +674,45 @@ class DAMIPolicy(nn.Module):
     ) -> Context:
         """Encodes what names a task. It depends on no observation: once a rollout is enough.
 
-        Takes instruction features (D, text_dim), and complete demonstrations, already strided:
-        (D, T, N, 3) in metres, (D, T, S), (D, T, A). Returns what `loss` and `sample_actions`
-        condition on. Raises ValueError for more frames than learned positions.
+        Args:
+            text: instruction features (D, text_dim).
+            demo_points, demo_state, demo_action: complete demonstrations, already strided:
+                (D, T, N, P) in metres, (D, T, S), (D, T, A).
+
+        Returns:
+            What `loss` and `sample_actions` condition on.
+
+        Raises:
+            ValueError: an input is missing or has a wrong shape, or a demonstration has more frames
+                than there are learned positions.
         """
-        config = self.config
-        if not config.reads_task:
+        if not self.reads_task:
             return None
-        tokens = None
-        if config.demo_encoder != "none":
-            shown = {"demo_points": demo_points, "demo_state": demo_state}
-            self.check_shapes(**shown, demo_action=demo_action, text=text)
-            if (T := demo_points.shape[1]) > (most := config.demo_positions):
-                raise ValueError(f"a demonstration has {T} frames, the policy {most} positions")
-            features = self.encode_observations(demo_points, demo_state)  # (D, T, feature)
-            actions = self.normalizer.normalize("action", demo_action)  # (D, T, A)
-            tokens = self.demo_encoder(features, actions)  # (D, T, demo_dim)
-        else:
+        if not self.reads_demonstration:
             self.check_shapes(text=text)
+            return self.u2t.encode_context(None, text)
+        self.check_shapes(
+            demo_points=demo_points, demo_state=demo_state, demo_action=demo_action, text=text
+        )
+        T, most = demo_points.shape[1], self.config.demo_positions
+        if T > most:
+            raise ValueError(f"a demonstration has {T} frames, the policy {most} positions")
+        features = self.encode_observations(demo_points, demo_state)  # (D, T, feature)
+        actions = self.normalizer.normalize("action", demo_action)  # (D, T, A)
+        tokens = self.demo_encoder(features, actions)  # (D, T, demo_dim)
         return self.u2t.encode_context(tokens, text)
 
     def denoise(
         self, noisy: Tensor, timesteps: Tensor, observation: Tensor, context: Context
     ) -> Tensor:
         """A_k (B, H, A), k (B,) int64, observation (B, To * feature) -> predicted A_0 (B, H, A)."""
-        h = self.unet.condition(timesteps, observation)  # (B, C)
-        return self.unet(noisy, h, None if context is None else self.u2t(h, context))
+        h = self.condition_encoder(timesteps, observation)  # (B, C)   Eq. 7
+        if context is None:
+            return self.denoiser(noisy, h)
+        fused = self.u2t(h, context)  # (B, C)
+        if self.config.tcfm == "none":
+            return self.denoiser(noisy, fused)
+        return self.denoiser(noisy, h, fused)
 
     def loss(
         self,
@@ -567,7 +721,7 @@ class DAMIPolicy(nn.Module):
         action: Tensor,
         noise: Tensor,
         timesteps: Tensor,
-        **task,
+        **task: Tensor,
     ) -> Tensor:
         """The diffusion loss, () float: squared error of the predicted clean actions (Eq. 1).
 
@@ -577,12 +731,16 @@ class DAMIPolicy(nn.Module):
 
         Args:
             points, state, action: B windows, the older observation first, ordered by task:
-                (B, To, N, 3) in metres, (B, To, S), (B, H, A).
+                (B, To, N, P) in metres, (B, To, S), (B, H, A).
             noise, timesteps: standard normal (B, H, A), and k in [0, K), (B,) int64.
             task: the arguments of `encode_demo`, of D tasks; D divides B.
+
+        Raises:
+            ValueError: an input is missing or has a wrong shape.
         """
-        chunks = {"action": action, "noise": noise, "timesteps": timesteps}
-        self.check_shapes(points=points, state=state, **chunks)
+        self.check_shapes(
+            points=points, state=state, action=action, noise=noise, timesteps=timesteps
+        )
         context = self.encode_demo(**task)
         clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
         noisy = self.schedule.add_noise(clean, noise, timesteps)  # A_k, (B, H, A)
@@ -597,12 +755,20 @@ class DAMIPolicy(nn.Module):
     ) -> Tensor:
         """Draws an action chunk by DDIM from Gaussian noise.
 
-        Takes the last To observations, the older first, (B, To, N, 3) in metres and (B, To, S), the
-        context of D tasks, and the source of the initial noise. Returns (B, Ta, A), to be executed
-        from the newest observation on, in the demonstrations' unit.
+        Args:
+            points, state: the last To observations, the older first: (B, To, N, P) in metres, and
+                (B, To, S).
+            context: what `encode_demo` makes of D tasks; D divides B.
+            generator: the source of the initial noise; None: PyTorch's global one.
+
+        Returns:
+            (B, Ta, A), to be executed from the newest observation on, in the demonstrations' unit.
+
+        Raises:
+            ValueError: the context is missing, or an input has a wrong shape.
         """
         self.check_shapes(points=points, state=state)
-        if context is None and self.config.reads_task:
+        if context is None and self.reads_task:
             raise ValueError("context is missing: it is what `encode_demo` makes of a task")
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
         shape = (len(points), self.config.horizon, self.config.action_dim)
@@ -612,43 +778,55 @@ class DAMIPolicy(nn.Module):
             timesteps = torch.full((len(points),), k, device=points.device)
             prediction = self.denoise(actions, timesteps, observation, context)  # (B, H, A)
             actions = self.schedule.step(prediction, k, actions)
+        return self.select_action_chunk(actions)
 
-        return self.executed(actions)
-
-    def executed(self, actions: Tensor) -> Tensor:
+    def select_action_chunk(self, actions: Tensor) -> Tensor:
         """Normalized (B, H, A) -> (B, Ta, A) from the newest observation on, in their own unit."""
         newest = self.config.n_obs_steps - 1
         chunk = actions[:, newest : newest + self.config.n_action_steps]  # (B, Ta, A)
         return self.normalizer.unnormalize("action", chunk)
 
+    def shapes(self) -> dict[str, tuple[int | str, ...]]:
+        """The shape that each input must have.
+
+        A letter stands for a size that is not given, and that is the same in all inputs of a call.
+        """
+        To, H = self.config.n_obs_steps, self.config.horizon
+        P, S, A = self.config.point_dim, self.config.state_dim, self.config.action_dim
+        return {
+            "points": ("B", To, "N", P),
+            "state": ("B", To, S),
+            "action": ("B", H, A),
+            "noise": ("B", H, A),
+            "timesteps": ("B",),
+            "text": ("D", self.config.text_dim),
+            "demo_points": ("D", "T", "N", P),
+            "demo_state": ("D", "T", S),
+            "demo_action": ("D", "T", A),
+        }
+
     def check_shapes(self, **inputs: Tensor | None) -> None:
         """Raises ValueError for what is missing, or would broadcast to a wrong result silently."""
-        sizes = {}  # what each letter stands for; a number for itself
+        shapes = self.shapes()
+        sizes = {}  # letter -> its size in the first input that has it
         for name, x in inputs.items():
-            expected, found = self.shapes()[name], () if x is None else tuple(x.shape)
-            if len(found) == len(expected):
-                for n, size in zip(expected, found):
-                    sizes.setdefault(n, size if isinstance(n, str) else n)
-                expected = tuple(sizes[n] for n in expected)
-            if found != expected:
-                found, takes = "missing" if x is None else found, str(expected).replace("'", "")
+            expected = shapes[name]
+            if x is not None and x.dim() == len(expected):
+                for letter, size in zip(expected, x.shape):
+                    if isinstance(letter, str):
+                        sizes.setdefault(letter, size)
+                expected = tuple(sizes.get(letter, letter) for letter in expected)
+            if x is None or tuple(x.shape) != expected:
+                found = "missing" if x is None else tuple(x.shape)
+                takes = str(expected).replace("'", "")
                 raise ValueError(f"{name} is {found}, the policy takes {takes}")
-
-    def shapes(self) -> dict[str, tuple[int | str, ...]]:
-        """What each input's shape must be, where a letter stands for any size, but one for all."""
-        To, S, A = self.config.n_obs_steps, self.config.state_dim, self.config.action_dim
-        seen = {"points": ("B", To, "N", 3), "state": ("B", To, S), "timesteps": ("B",)}
-        shown = {"demo_points": ("D", "T", "N", 3), "demo_state": ("D", "T", S)}
-        shown |= {"demo_action": ("D", "T", A), "text": ("D", self.config.text_dim)}
-        chunk = ("B", self.config.horizon, A)
-        return {**seen, **shown, "action": chunk, "noise": chunk}
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
         """Draws what makes `loss` pure: noise (n, H, A) and timesteps (n,) int64."""
-        config, device = self.config, self.normalizer.action_scale.device
-        source = {"generator": generator, "device": generator.device}
-        noise = torch.randn(n, config.horizon, config.action_dim, **source)
-        timesteps = torch.randint(config.diffusion_steps, (n,), **source)
+        H, A, K = self.config.horizon, self.config.action_dim, self.config.diffusion_steps
+        source, device = generator.device, self.normalizer.action_scale.device
+        noise = torch.randn(n, H, A, generator=generator, device=source)
+        timesteps = torch.randint(K, (n,), generator=generator, device=source)
         return {"noise": noise.to(device), "timesteps": timesteps.to(device)}
 
 
@@ -664,6 +842,180 @@ def ema_model(policy: DAMIPolicy) -> AveragedModel:
         torch._foreach_lerp_(averaged, current, 1 - decay)
 
     return AveragedModel(policy, multi_avg_fn=update)
+
+
+# ---- What a configuration names, and presets -----------------------------------------------------
+
+
+class DP3Policy(DAMIPolicy):
+    """DP3: the policy without demonstration and instruction."""
+
+    reads_task = False
+    reads_demonstration = False
+
+
+# The policies by `PolicyConfig.policy`. baselines.py adds its own when it is imported.
+POLICIES: dict[str, type[DAMIPolicy]] = {"dami": DAMIPolicy, "dp3": DP3Policy}
+
+
+def choices() -> dict[str, tuple[str, ...]]:
+    """Field of `PolicyConfig` -> the names that it may hold, registered ones among them."""
+    return {
+        "policy": tuple(POLICIES),
+        "denoiser": tuple(denoisers),
+        "demo_encoder": (*demo_encoders, "none"),
+        "tcfm": ("down", "mid", "up", "none"),
+        "sampler": ("ddim", "dp3"),
+    }
+
+
+def build_policy(config: PolicyConfig) -> DAMIPolicy:
+    """The policy that a configuration names, with fresh weights.
+
+    Raises ValueError, as the policy's class does, for a configuration that does not fit it.
+    """
+    return POLICIES[config.policy](config)
+
+
+# `small` is for two CPU cores, `tiny` to see everything run. What is not named here is the paper's.
+# fmt: off
+PRESETS = {
+    "paper": PolicyConfig(),
+    "small": PolicyConfig(
+        num_points=128, pointnet_widths=(32, 64, 128), state_feature_dim=32, timestep_dim=64,
+        demo_stride=16, demo_positions=13,  # 13 of a demonstration's 200 frames
+        unet_widths=(32, 64, 128), n_action_steps=4, inference_steps=5,
+    ),
+    "tiny": PolicyConfig(
+        num_points=64, pointnet_widths=(16, 32), point_feature_dim=16, state_feature_dim=16,
+        demo_stride=20, demo_positions=10, demo_dim=32, timestep_dim=32, unet_widths=(16, 32),
+    ),
+}
+# fmt: on
+
+
+# ---- Files of policies ---------------------------------------------------------------------------
+
+FORMAT = "DAMI checkpoint 2"
+
+
+class CheckpointError(ValueError):
+    """A file holds no policy, is damaged or cannot be written; the message is one line."""
+
+
+def save(path: str | Path, policy: DAMIPolicy, *, half: bool = False, **info: Any) -> None:
+    """Writes a policy to a file: its configuration, weights and normalizer, and `info`.
+
+    The file is written whole or not at all: what was there before stays until the new one is.
+
+    Args:
+        half: stores the weights as float16, half the size; `load` gives float32 again.
+        info: tensors and plain values, which `load` returns beside the policy.
+
+    Raises:
+        CheckpointError: the weights are not finite, or the file cannot be written.
+    """
+    path = Path(path)
+    weights = policy.state_dict()
+    if half:
+        for name, parameter in policy.named_parameters():
+            weights[name] = parameter.detach().half()
+    if not all(torch.isfinite(x).all() for x in weights.values()):
+        raise CheckpointError(
+            f"{path} was not written, because weights are not finite: lower the learning rates"
+        )
+    content = dict(format=FORMAT, config=asdict(policy.config), model=weights, **info)
+    try:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+            temporary = Path(folder) / path.name
+            torch.save(content, temporary)
+            os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:  # torch.save reports a full disk as RuntimeError
+        raise CheckpointError(
+            f"cannot write {path}, look at the space and the permissions there: {one_line(error)}"
+        ) from error
+
+
+def load(
+    path: str | Path,
+    device: str | torch.device = "cpu",
+    *,
+    needs: Sequence[str] = (),
+    **config_overrides: Any,
+) -> tuple[DAMIPolicy, dict[str, Any]]:
+    """Rebuilds the policy that `save` wrote to a file, in evaluation mode on `device`.
+
+    Args:
+        needs: names that must be in the file's `info`.
+        config_overrides: fields of the configuration that take the place of those in the file.
+
+    Returns:
+        (policy, info): info is what `save` was given.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, not one of `save` or of an older version of
+            it, lacks one of `needs`, or its weights and its configuration do not fit.
+    """
+    path = Path(path)
+    content = read_archive(path, device)
+    version = content.pop("format", None) if isinstance(content, dict) else None
+    if version == "DAMI checkpoint 1":
+        raise CheckpointError(
+            f"{path} was written by an older version of this code: train again, or use that version"
+        )
+    if version != FORMAT:
+        raise CheckpointError(f"{path} holds no policy that this code saved: use another file")
+    missing = [name for name in needs if name not in content]
+    if missing:
+        raise CheckpointError(
+            f"{path} lacks {', '.join(missing)}: use a file of train.py or finetune.py"
+        )
+
+    try:
+        config = replace(PolicyConfig(**content.pop("config")), **config_overrides)
+        policy = restore_policy(config, content.pop("model"), device)
+    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{path}: weights and configuration do not fit: {one_line(error)}"
+        ) from error
+    return policy, content
+
+
+def read_archive(path: Path, device: str | torch.device) -> Any:
+    """What torch.save wrote to a file, none of it code; CheckpointError for a damaged file."""
+    if not path.is_file():
+        raise CheckpointError(f"no checkpoint at {path}: name a .pt file")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()  # torch.load does not compare the check sums
+            for entry in archive.infolist():
+                if entry.external_attr:  # not of torch.save; torch could take it for a folder
+                    damaged = entry.filename
+        if damaged is None:
+            return torch.load(path, map_location=device, weights_only=True)
+    except PermissionError as error:
+        raise CheckpointError(f"{path} cannot be read: {error.strerror}") from error
+    except Exception as error:  # zipfile and torch raise many types; each means it is damaged
+        raise CheckpointError(
+            f"{path} is damaged or no PyTorch checkpoint: use another file"
+        ) from error
+    raise CheckpointError(f"{path} is damaged (in {damaged!r}): use another file")
+
+
+def restore_policy(
+    config: PolicyConfig, weights: dict[str, Tensor], device: str | torch.device
+) -> DAMIPolicy:
+    """A policy with these weights, in evaluation mode; an error of PyTorch's where they differ."""
+    with torch.device("meta"):  # takes no memory, for a size that the file may not hold
+        sizes = {name: x.to("meta") for name, x in weights.items()}
+        build_policy(config).load_state_dict(sizes)
+    policy = build_policy(config).to(device)
+    policy.load_state_dict(weights)
+    return policy.eval()
+
+
+def one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
 
 
 # ---- Written out for speed, or for PyTorch's bug: skip this when reading the method --------------
@@ -718,17 +1070,18 @@ class Conv1d(nn.Conv1d):
         return F.linear(windows, self.weight.flatten(1), self.bias).transpose(1, 2)
 
 
-class WinningPoints(torch.autograd.Function):
-    """Which points of each cloud win the maximum over points in some channel of a PointNet.
+class CriticalPoints(torch.autograd.Function):
+    """Which points of each cloud have the maximum over points in some channel of a PointNet.
 
-    A third of 128 do, a sixth of 512. A pass without gradient finds them, a few clouds at a time,
-    which stay in the CPU's cache. Their number depends on the data: `vmap` needs a rule of its own.
+    Of 128 points a third do, of 512 a sixth. A pass without gradient finds them, a few clouds at a
+    time, which stay in the CPU's cache. Their number depends on the data, which is why `vmap` needs
+    a rule of its own.
     """
 
     @staticmethod
     def forward(points: Tensor, *layers: Tensor) -> Tensor:
-        """points (..., N, 3); weight, bias, norm's weight and bias of each layer -> (..., W)."""
-        return WinningPoints.indices(WinningPoints.wins(points, layers), len(layers[-1]))
+        """points (..., N, P); weight, bias, norm's weight and bias of each layer -> (..., M)."""
+        return CriticalPoints.indices(CriticalPoints.mark(points, layers), len(layers[-1]))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
@@ -736,32 +1089,35 @@ class WinningPoints(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor) -> tuple[Tensor, int]:
-        """`forward` for several tasks, one after the other; (tasks, ..., W) has one W for all."""
-        won = []
+        """`forward` for several tasks, one after the other; (tasks, ..., M) has one M for all."""
+        marked = []
         for task in range(info.batch_size):
             entries = [x if dim is None else x.select(dim, task) for x, dim in zip(inputs, in_dims)]
-            won.append(WinningPoints.wins(entries[0], entries[1:]))
-        return WinningPoints.indices(torch.stack(won), inputs[-1].shape[-1]), 0
+            marked.append(CriticalPoints.mark(entries[0], entries[1:]))
+        return CriticalPoints.indices(torch.stack(marked), inputs[-1].shape[-1]), 0
 
     @staticmethod
-    def wins(points: Tensor, layers: Sequence[Tensor]) -> Tensor:
-        """points (..., N, 3) -> (..., N) int8: 1 for those that win a channel."""
-        clouds = points.reshape(-1, *points.shape[-2:])  # (clouds, N, 3)
+    def mark(points: Tensor, layers: Sequence[Tensor]) -> Tensor:
+        """points (..., N, P) -> (..., N) int8: 1 for critical points."""
+        clouds = points.reshape(-1, *points.shape[-2:])  # (clouds, N, P)
         at_once = len(clouds) if points.is_cuda else max(1, 4096 // points.shape[-2])
-        winners = []
+        largest = []
         for x in clouds.split(at_once):
             for weight, bias, norm_weight, norm_bias in zip(*(layers[i::4] for i in range(4))):
                 x = F.linear(x, weight, bias)  # (at_once, N, width)
                 x = F.layer_norm(x, bias.shape, norm_weight, norm_bias).relu_()
-            winners.append(x.max(dim=-2).indices)  # (at_once, widths[-1]); faster than argmax
-        won = torch.zeros(clouds.shape[:-1], dtype=torch.int8, device=points.device)
-        return won.scatter_(-1, torch.cat(winners), 1).view(points.shape[:-1])
+            largest.append(x.max(dim=-2).indices)  # (at_once, widths[-1]); faster than argmax
+        marked = torch.zeros(clouds.shape[:-1], dtype=torch.int8, device=points.device)
+        return marked.scatter_(-1, torch.cat(largest), 1).view(points.shape[:-1])
 
     @staticmethod
-    def indices(won: Tensor, channels: int) -> Tensor:
-        """(..., N) int8 -> (..., W) int64: winners first, then others, W the most in any cloud."""
-        if won.is_cuda:
-            most = min(channels, won.shape[-1])  # a bound: the host does not wait for the GPU
+    def indices(marked: Tensor, channels: int) -> Tensor:
+        """(..., N) int8 -> (..., M) int64: critical points first, then others.
+
+        M is the largest number of critical points in any cloud.
+        """
+        if marked.is_cuda:
+            most = min(channels, marked.shape[-1])  # a bound: the host does not wait for the GPU
         else:
-            most = int(won.sum(dim=-1).max())
-        return won.argsort(dim=-1, descending=True, stable=True)[..., :most]
+            most = int(marked.sum(dim=-1).max())
+        return marked.argsort(dim=-1, descending=True, stable=True)[..., :most]

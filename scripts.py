@@ -17,13 +17,11 @@ import platform
 import queue
 import re
 import shlex
-import shutil
 import signal
 import sys
 import threading
 import time
 import warnings
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -41,11 +39,12 @@ from torch.optim.swa_utils import AveragedModel
 from torch.utils._pytree import tree_leaves, tree_map
 from tqdm import tqdm
 
-from baselines import PRESETS, build_policy
+import model
+from baselines import PRESETS
 from clip import text_features
 from common import UserError  # until train.py, finetune.py and evaluate.py use common.command_line
 from data import Demonstrations, WindowSampler, write_atomically, write_text
-from model import CHOICES, DAMIPolicy, PolicyConfig
+from model import DAMIPolicy, PolicyConfig
 
 try:
     import fcntl
@@ -103,7 +102,7 @@ def of_presets(values: dict[str, Any]) -> str:
 def add_architecture_flags(parser: argparse.ArgumentParser) -> None:
     """Adds the flags of what `choose_config` makes a policy's configuration of."""
     add = parser.add_argument_group("architecture (default: the preset's)").add_argument
-    flags = {name: {"choices": choices} for name, choices in CHOICES.items()}
+    flags = {name: {"choices": choices} for name, choices in model.choices().items()}
     for name, options in (flags | {"num_points": {"type": int}}).items():
         values = {preset: getattr(config, name) for preset, config in PRESETS["dami"].items()}
         what = "points of a cloud" if name == "num_points" else "see model.PolicyConfig"
@@ -112,7 +111,9 @@ def add_architecture_flags(parser: argparse.ArgumentParser) -> None:
 
 def add_inference_flags(add: Callable[..., Any]) -> None:
     """Adds the flags of what may be another in a rollout than in the training, see `inference`."""
-    add("--sampler", choices=CHOICES["sampler"], help="DDIM as published, or as DP3 runs it")
+    add(
+        "--sampler", choices=model.choices()["sampler"], help="DDIM as published, or as DP3 runs it"
+    )
     add("--n-action-steps", type=int, help="actions until the policy looks again")
     add("--inference-steps", type=int, help="of the diffusion for each draw")
 
@@ -267,7 +268,7 @@ def choose_config(
 ) -> PolicyConfig:
     """A preset's architecture with what was given, and with the dimensions of own recordings."""
     recordings = list(recorded.values())
-    names = (*CHOICES, "num_points")
+    names = (*model.choices(), "num_points")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     config = replace(PRESETS[args.policy or "dami"][preset], **given)
     if own:
@@ -373,30 +374,10 @@ def draw_demonstration(
 
 # ---- Checkpoints ---------------------------------------------------------------------------------
 
-CHECKPOINT_FORMAT = "DAMI checkpoint 1"
-
 
 def save_checkpoint(path: str | Path, policy: DAMIPolicy, half: bool = False, **info: Any) -> None:
-    """Writes configuration, weights, normalizer and `info` (tensors, plain values), atomically.
-
-    `half` stores the weights as float16, half the size; `load_checkpoint` gives float32 again.
-    """
-    path = Path(path)
-    weights = policy.state_dict()
-    if not all(torch.isfinite(x).all() for x in weights.values()):
-        raise ValueError(f"{path} was not written: the weights are not finite, lower the rates")
-    if half:
-        weights |= {name: p.detach().half() for name, p in policy.named_parameters()}
-    config = asdict(policy.config)
-    config = {name: list(v) if isinstance(v, tuple) else v for name, v in config.items()}
-    content = {"format": CHECKPOINT_FORMAT, "config": config, "model": weights, **info}
-
-    try:
-        write_atomically(path, lambda temporary: torch.save(content, temporary))
-    except RuntimeError as error:  # how torch.save reports a full disk
-        free = shutil.disk_usage(path.parent).free / 1e6  # MB
-        advice = "make room" if free < 1000 else "look at its permissions and at `ulimit -f`"
-        raise OSError(f"cannot write {path}, {free:.0f} MB are free there: {advice}") from error
+    """`model.save`."""  # old name, until the scripts call that
+    model.save(path, policy, half=half, **info)
 
 
 def checkpoints_of(path: str | Path) -> list[Path]:
@@ -415,43 +396,8 @@ def checkpoints_of(path: str | Path) -> list[Path]:
 def load_checkpoint(
     path: str | Path, device: str | torch.device = "cpu", needs: Sequence[str] = (), **changed: Any
 ) -> tuple[DAMIPolicy, dict[str, Any]]:
-    """Rebuilds the policy of a checkpoint, a folder's last, in evaluation mode on `device`.
-
-    Returns (policy, info): info is everything else in the file. What is in `changed` takes the
-    place of the same in the configuration. Raises ValueError for a file that is missing, damaged,
-    not one of ours, lacks a name in `needs`, or whose weights do not fit.
-    """
-    path = checkpoints_of(path)[-1]
-    if not path.is_file():
-        raise ValueError(f"no checkpoint at {path}: name a .pt file, or train one with train.py")
-    try:
-        with zipfile.ZipFile(path) as archive:  # torch.load does not look at the check sums
-            odd = [entry.filename for entry in archive.infolist() if entry.external_attr]
-            damaged = archive.testzip() or next(iter(odd), None)  # attributes: a folder to torch
-        info = None if damaged else torch.load(path, map_location=device, weights_only=True)
-    except PermissionError:
-        raise
-    except Exception as error:  # torch raises many types here; each means it cannot be read
-        raise ValueError(f"{path} is damaged or no PyTorch checkpoint: use another file") from error
-
-    if damaged:
-        raise ValueError(f"{path} is damaged (in {damaged!r}): use another file")
-    ours = isinstance(info, dict) and info.get("format") == CHECKPOINT_FORMAT
-    missing = [name for name in needs if not ours or name not in info]
-    if not ours or missing:
-        lacks = f" (it lacks {', '.join(missing)})" if ours else ""
-        raise ValueError(f"{path} is not a file of train.py or finetune.py{lacks}: use such a one")
-    try:
-        config, weights = PolicyConfig(**info.pop("config")), info.pop("model")
-        config = replace(config, **changed)
-        with torch.device("meta"):  # no memory for a size that the file does not hold
-            build_policy(config).load_state_dict({k: x.to("meta") for k, x in weights.items()})
-        policy = build_policy(config).to(device)
-        policy.load_state_dict(weights)
-    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path}: weights and configuration do not fit: {reason}") from error
-    return policy.eval(), info
+    """`model.load`, of a folder its last."""  # old name, until the scripts call that
+    return model.load(checkpoints_of(path)[-1], device, needs=needs, **changed)
 
 
 def digest(samplers: dict[str, WindowSampler]) -> str:
@@ -563,7 +509,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 def remove_temporaries(folder: Path) -> None:
     """Removes what killed processes left of files they were writing."""
-    for temporary in folder.glob(".[0-9]*.*"):  # of `write_atomically` and `save_checkpoint`
+    for temporary in folder.glob(".[0-9]*.*"):  # of `write_atomically`
         try:
             os.kill(int(temporary.name.split(".")[1]), 0)
         except (ProcessLookupError, ValueError, OverflowError):

@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import json
 import os
 import signal
 import subprocess
@@ -15,13 +14,18 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before torch; on small matrices threads w
 import pytest
 import torch
 
+import baselines  # noqa: F401  its policies are registered
 import clip
+import common
 import evaluate
-import scripts
-import simulator
+import metaworld_env
+import model
 import train
+from data import RecordingError
+from model import CheckpointError
+from robot import RobotError
+from simulator import collect
 
-sys.modules["torch.utils.tensorboard"] = None  # where it is installed: tests count a run's files
 BASE, NOVEL = ["reach", "drawer-close", "window-open"], ["door-close"]
 SMALL_ML10 = {"train": [f"{task}-v3" for task in BASE], "test": [f"{task}-v3" for task in NOVEL]}
 FEW = (
@@ -48,7 +52,7 @@ def pytest_unconfigure(config):
 def recorded(tmp_path_factory):
     """A folder with two expert demonstrations of each task in BASE and NOVEL."""
     folder = tmp_path_factory.mktemp("demonstrations")
-    simulator.collect(BASE + NOVEL, folder, episodes=2)
+    collect(metaworld_env.MetaWorld(), BASE + NOVEL, folder, episodes=2)
     return folder
 
 
@@ -56,7 +60,7 @@ def recorded(tmp_path_factory):
 def three_tasks():
     """ML10 with three of its ten base tasks; the text tower is built once, not at every call."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(simulator.SUITES, "ml10", SMALL_ML10)
+        patch.setitem(metaworld_env.SUITES, "ml10", SMALL_ML10)
         patch.setattr(clip, "load_clip_text_encoder", load_once)
         yield patch
 
@@ -76,6 +80,7 @@ def own_folder(tmp_path, monkeypatch):
     """The test runs in an empty folder, and leaves the process as it was."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     handlers, threads = [signal.getsignal(n) for n in numbers], torch.get_num_threads()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # `nohup python -m pytest` ignores it
     monkeypatch.chdir(tmp_path)
     yield tmp_path
     for number, handler in zip(numbers, handlers):
@@ -98,9 +103,9 @@ def run(recorded, tmp_path_factory):
 def fails(script, argv, capsys):
     """Runs a script that must end with exit code 2 and one line on stderr; returns the line."""
     capsys.readouterr()
-    errors = [script.RobotError] if hasattr(script, "RobotError") else []
+    errors = (RecordingError, CheckpointError, RobotError)
     with pytest.raises(SystemExit) as end:
-        scripts.command_line(lambda: script.main([str(arg) for arg in argv]), *errors)
+        common.command_line(lambda: script.main([str(arg) for arg in argv]), errors=errors)
     error = capsys.readouterr().err.split("\r")[-1]  # after a progress bar
     line = error.strip("\n").split("\n")[-1]
     assert end.value.code == 2 and line.startswith("error: ") and "Traceback" not in error, error
@@ -109,7 +114,7 @@ def fails(script, argv, capsys):
 
 def weights(path):
     """A checkpoint's state_dict and information."""
-    policy, info = scripts.load_checkpoint(path)
+    policy, info = model.load(path)
     return policy.state_dict(), info
 
 
@@ -138,4 +143,4 @@ def fingerprint(folder):
 
 def metrics(folder):
     """The lines of a run's metrics.jsonl."""
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return common.read_json_lines(folder / "metrics.jsonl")
