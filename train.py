@@ -330,8 +330,10 @@ def meta_train(
 
 # ---- Checkpoints, and last.pt, which a run goes on from ------------------------------------------
 
-SAVE_SECONDS = 20  # between two savings of last.pt, at least: a killed run loses no more,
-SAVE_SHARE = 0.04  # unless saving so often would take more than this share of the time
+# last.pt is written every SAVE_SECONDS, which is what a killed run loses at most; but more seldom
+# where a large one is so slow that this would take more than SAVE_SHARE of the time.
+SAVE_SECONDS = 20
+SAVE_SHARE = 0.04
 
 # These may differ when a run is resumed: they change no number, `vectorize` only its last bits.
 FREE_TO_CHANGE = ("vectorize", "checkpoint_every", "evaluate_every", "episodes")

@@ -34,21 +34,13 @@ ROOT = Path(train.__file__).resolve().parent
 SHORT = (
     "--preset tiny --steps 6 --checkpoint-every 3 --clip-weights random --device cpu --threads 1"
 ).split()
-pytestmark = pytest.mark.usefixtures("small_suite", "own_folder", "default_signals")
+pytestmark = pytest.mark.usefixtures("small_suite", "own_folder", "no_curves")
 
 
 @pytest.fixture
-def default_signals(monkeypatch):
-    """Signals do what they do in a terminal, although `nohup` or a `&` may ignore some of them.
-
-    Curves, half a second each, are drawn only where a test asks for them.
-    """
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    previous = [signal.signal(number, signal.default_int_handler) for number in numbers]
+def no_curves(monkeypatch):
+    """No curves are drawn: they take half a second each."""
     monkeypatch.setattr(report, "plot_curves", lambda folder: (folder / "curves.png").touch())
-    yield
-    for number, handler in zip(numbers, previous):
-        signal.signal(number, handler)
 
 
 def save_pair(folder):
@@ -484,11 +476,11 @@ def test_saving_takes_a_few_per_cent_of_the_time(tmp_path, monkeypatch):
         model.PRESETS["tiny"], train.Settings(), {"stir": one_task()[1]}, "cpu"
     )
 
-    for seconds, waits in ((10.0, 250.0), (0.001, 20.0)):
+    for length, waits in ((10.0, 250.0), (0.001, 20.0)):
 
-        def save(*_, seconds=seconds, **__):
+        def save(*_, length=length, **__):
             nonlocal now
-            now += seconds
+            now += length
 
         monkeypatch.setattr(model, "save", save)
         saver = train.Saver(tmp_path / "last.pt", info={})
@@ -584,7 +576,7 @@ def test_two_processes_under_torchrun_train_as_one_does(pair, tmp_path):
 
     one, two = (whole_state(tmp_path / name)["training"]["policy"] for name in ("one", "two"))
     torch.manual_seed(0)
-    start = model.build_policy(weights(tmp_path / "one" / "last.pt", policy=True).config)
+    start = model.build_policy(model.load(tmp_path / "one" / "last.pt")[0].config)
     moved = all_weights(one) - all_weights(start.state_dict())
     assert (all_weights(one) - all_weights(two)).norm() < 1e-3 * moved.norm()
     assert moved.norm() > 0.1
@@ -775,7 +767,7 @@ REFUSED = {
     "--demonstrations 3": "3 demonstrations of pour asked for, there are 2",
     "--threads 0": "--threads is 0: use at least 1",
     "--num-points 0": "num_points is 0: use at least 1",
-    "--num-points 65": "(9, 4, 65)",
+    "--num-points 65": "pour has 64 points a cloud, the policy 65",
     "--policy flow --tcfm down": "flow reads no task",
     "--after-success -1": "--after-success is -1: use at least 0",
     "--seed -1": "--seed is -1: use at least 0",
