@@ -1,62 +1,190 @@
-"""Success rates: rollouts in Meta-World, in parallel processes, and animations of them.
+"""Success rates: rollouts in a simulator, in parallel processes, and animations of them.
 
     python evaluate.py                                       # base tasks, the newest run
     python evaluate.py --checkpoint runs/a runs/b --top 5    # all checkpoints of two runs
     python evaluate.py --task reach --gif reach.gif          # watch one rollout (.mp4 too)
     python evaluate.py --without instruction --swap demonstration    # is the demonstration read?
 
-An episode succeeds if any of its 200 steps reports success, so a rollout ends there. Each rollout
+An episode succeeds if any of its steps reports success, so a rollout ends there. Each rollout
 holds one reference demonstration, drawn from the task's own. Goals come from seeds that no
 demonstration uses. Nothing is adapted here: novel tasks are finetune.py's.
 
-One action, from the network to the simulated arm: `rollout` keeps two frames of each episode,
-`DAMIPolicy.sample_actions` draws a chunk of actions, `MetaWorldPointCloudEnv.advance` takes them.
+One action, from the network to the simulated arm: `rollout` keeps the last To observations of each
+episode, `DAMIPolicy.sample_actions` draws a chunk of actions from them, and the environment's
+`advance` takes these one by one. What an environment and a simulator are is stated in simulator.py.
 
-Letters: E episodes rolled out side by side, To observation steps, Ta executed actions,
-N points, A action dim, S state dim.
+Letters: E episodes rolled out side by side, To observation steps, Ta executed actions, N points,
+P point_dim, A action dim, S state dim.
 """
 
 import argparse
 import json
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-import data
-import scripts
-from data import Demonstrations, WindowSampler, load_demonstrations, write_atomically
-from model import DAMIPolicy
-from report import Successes, mean_interval, mean_success, parts_of, write_report
-from scripts import (
-    at_least,
-    checkpoints_of,
-    command_line,
-    format_table,
-    load_checkpoint,
-    run_jobs,
-    worker,
-    write_text,
-)
-from simulator import MetaWorldPointCloudEnv, check_task, collect, evaluation_seed, suite_tasks
+import baselines  # noqa: F401  (adds its policies to those that can be loaded)
+import common
+import model
+from clip import text_features
+from common import UserError, progress_bar, report_progress, run_jobs
+from data import RecordingError, WindowSampler, load_demonstrations, positions, write_atomically
+from model import CheckpointError, DAMIPolicy
+from report import Parts, Successes, mean_interval, mean_success, paper_columns, write_report
+from simulator import Environment, Simulator, check_task, collect, evaluation_seed, simulator_of
 
 EVALUATION_SEED = 0  # of the goals; the same for every seed of training
 EPISODES_A_JOB = 10  # side by side in one process; part of the protocol: it shapes the noise drawn
-SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
-TRAINED = ("suite", "preset", "arguments", "text_weights", "step")  # what train.py's files say
 
-# ---- What to measure, and on what ----------------------------------------------------------------
+# ---- Rollouts ------------------------------------------------------------------------------------
+
+
+def rollout(
+    policy: DAMIPolicy,
+    environments: Sequence[Environment],
+    seeds: Sequence[int],
+    sampler: WindowSampler,
+    text: Tensor,
+    generator: torch.Generator,
+    zero_demonstration: bool = False,
+) -> list[bool]:
+    """Rolls out E episodes of one task side by side, and says which of them succeeded.
+
+    The demonstrations are encoded once. The policy reads To frames in every Ta: the others are not
+    observed, since observing takes most of a simulator's time.
+
+    Args:
+        policy: in evaluation mode.
+        environments, seeds: E environments, and the seeds of their episodes.
+        sampler: of the task's demonstrations, from which one is drawn for each rollout.
+        text: instruction feature, (text_dim,).
+        generator: draws demonstrations and noise; on the CPU.
+        zero_demonstration: the policy reads zeros in place of its demonstration.
+
+    Returns:
+        E booleans.
+    """
+    To = policy.config.n_obs_steps
+    device = text.device
+
+    # Each rollout holds one reference demonstration. All are drawn before any noise is, and they
+    # are encoded one at a time, since they may differ in length.
+    contexts = []
+    demonstrations = [
+        sampler.demonstration(sampler.sample_episode(generator)) for _ in environments
+    ]
+    for demonstration in demonstrations:
+        if zero_demonstration:
+            demonstration = {name: torch.zeros_like(x) for name, x in demonstration.items()}
+        with torch.no_grad():
+            contexts.append(policy.encode_demo(text[None], **demonstration))
+
+    # Of each episode the last To observations, the oldest first; at the beginning it is repeated.
+    observations = []
+    for environment, seed in zip(environments, seeds):
+        environment.begin(seed)
+        observations.append([environment.observe()] * To)
+
+    success = [False] * len(environments)
+    running = list(range(len(environments)))
+    while running:
+        points = np.stack([[o["point_cloud"] for o in observations[e]] for e in running])
+        state = np.stack([[o["agent_pos"] for o in observations[e]] for e in running])
+        chunks = sample_chunks(
+            policy,
+            points=torch.from_numpy(points).to(device),  # (E, To, N, P)
+            state=torch.from_numpy(state).to(device),  # (E, To, S)
+            contexts=[contexts[e] for e in running],
+            generator=generator,
+        )  # (E, Ta, A)
+
+        for e, chunk in zip(list(running), chunks):
+            seen, success[e], ended = take_actions(environments[e], chunk, To)
+            observations[e] = [*observations[e], *seen][-To:]
+            if ended:
+                running.remove(e)
+    return success
+
+
+def sample_chunks(
+    policy: DAMIPolicy,
+    points: Tensor,
+    state: Tensor,
+    contexts: Sequence[tuple[Tensor, ...] | None],
+    generator: torch.Generator,
+) -> np.ndarray:
+    """Draws action chunks (E, Ta, A) for observations (E, To, N, P), (E, To, S) and E contexts."""
+    if contexts[0] is None:  # this architecture reads no task
+        return policy.sample_actions(points, state, None, generator).cpu().numpy()
+
+    lengths = {context[0].shape for context in contexts}
+    if len(lengths) == 1:
+        together = tuple(torch.cat(parts) for parts in zip(*contexts))
+        return policy.sample_actions(points, state, together, generator).cpu().numpy()
+
+    chunks = [  # demonstrations of different lengths cannot be stacked
+        policy.sample_actions(points[[e]], state[[e]], context, generator)
+        for e, context in enumerate(contexts)
+    ]
+    return torch.cat(chunks).cpu().numpy()
+
+
+def take_actions(
+    environment: Environment, chunk: np.ndarray, n_observations: int
+) -> tuple[list[dict[str, np.ndarray]], bool, bool]:
+    """Takes the actions of a chunk (Ta, A), up to the end of the episode.
+
+    Returns the observations after the last `n_observations` actions (fewer if the chunk is shorter,
+    or the episode ends before), whether the episode succeeded, and whether it ended. A success
+    ends it: no later step could undo that.
+    """
+    seen = []
+    for i, action in enumerate(chunk):
+        _, truncated, info = environment.advance(action)
+        if info["success"] or truncated:
+            return seen, info["success"], True
+        if i >= len(chunk) - n_observations:
+            seen.append(environment.observe())
+    return seen, False, False
+
+
+# ---- Checkpoints, and what they say --------------------------------------------------------------
+
+SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
+TRAINED = ("suite", "preset", "arguments", "text_weights", "step")  # beside train.py's weights
+
+
+def checkpoints_of(path: str | Path) -> list[Path]:
+    """A file as it is; of a run's folder all its EMA checkpoints, the last one last.
+
+    Raises UserError for a folder without checkpoints.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    by_step = sorted(path.glob("ema-*.pt"), key=lambda file: (len(file.name), file.name))
+    found = by_step or list(path.glob("adapted.pt"))
+    if not found:
+        inside = ", ".join(str(file.parent) for file in sorted(path.glob("*/adapted.pt")))
+        instead = inside or "a folder of train.py or finetune.py, or a .pt file"
+        raise UserError(f"{path} holds no checkpoint: name {instead}")
+    return found
 
 
 def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
     """The last checkpoint of the newest finished run on `suite`; without any, the one that ships.
 
     Runs of `tiny` do not count: they show that everything works, and succeed nearly nowhere.
+    Raises UserError where there is neither.
     """
     finished = []
     for config in Path(runs).glob("*/config.json"):
@@ -68,324 +196,233 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
     if finished:
         return max(finished, key=lambda path: path.stat().st_mtime)
     if suite != "ml10" or not SHIPPED_CHECKPOINT.is_file():
-        raise ValueError(
-            f"no finished run on {suite} in {runs}/: train one, or name a --checkpoint"
-        )
+        raise UserError(f"no finished run on {suite} in {runs}/: train one, or name a --checkpoint")
     print(f"no finished run in {runs}/: using the policy that comes with the code", flush=True)
     return SHIPPED_CHECKPOINT
 
 
-# ---- Rollouts ------------------------------------------------------------------------------------
+def load_trained(
+    path: str | Path, device: str | torch.device = "cpu", **config_overrides: Any
+) -> tuple[DAMIPolicy, dict[str, Any]]:
+    """Loads a file of train.py or finetune.py, as `model.load` does.
 
-
-class Environment(Protocol):
-    """What `rollout` asks of a simulator: Meta-World's, or your own with these three methods.
-
-    An observation holds "point_cloud" (N, 3) and "agent_pos" (S,), both float32, as the policy was
-    trained on them. simulator.RayCastCamera makes clouds of any MuJoCo model.
+    Returns (policy in evaluation mode, what else the file says). Raises CheckpointError for a file
+    that does not say how it was trained, see `TRAINED`.
     """
-
-    def reset(self, *, seed: int) -> tuple[dict[str, np.ndarray], dict]:
-        """Begins the episode of a seed; returns (observation, info)."""
-
-    def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
-        """Takes one step with an action (A,); returns (reward, truncated, {"success": bool}).
-
-        After a success, or `truncated`, it is not called again.
-        """
-
-    def observe(self) -> dict[str, np.ndarray]:
-        """The observation of the present moment."""
+    policy, info = model.load(path, device, **config_overrides)
+    missing = [name for name in TRAINED if name not in info]
+    if missing:
+        lacks = ", ".join(missing)
+        raise CheckpointError(f"{path} is no file of train.py or finetune.py: it lacks {lacks}")
+    return policy, info
 
 
-def rollout(
-    policy: DAMIPolicy,
-    envs: Sequence[Environment],
-    seeds: Sequence[int],
-    sampler: WindowSampler,
-    text: Tensor,
-    generator: torch.Generator,
-    on_chunk: Callable[[], None] | None = None,
-    blank: bool = False,
-) -> list[bool]:
-    """Rolls out E episodes of one task side by side, and says which of them succeeded.
+def reads_instruction(info: dict[str, Any]) -> bool:
+    """Whether a checkpoint's policy is given its instruction: unless it was adapted without."""
+    return info.get("adaptation", {}).get("instruction", True)
 
-    The demonstrations are encoded once. The policy reads To frames in every Ta: in the others no
-    ray is cast.
+
+def instruction_features(
+    instructions: dict[str, str],
+    weights: str | None,
+    identity: str | None,
+    device: str | torch.device,
+    use_instruction: bool = True,
+) -> tuple[dict[str, Tensor], str]:
+    """Encodes instructions with CLIP's text tower.
 
     Args:
-        policy: in evaluation mode.
-        envs, seeds: E simulators, see `Environment`, and the seeds of their goals.
-        sampler: of the task's demonstrations, from which one a rollout is drawn.
-        text: instruction feature, (text_dim,).
-        generator: draws demonstrations and noise; on the CPU.
-        on_chunk: called before each round of chunks.
-        blank: the policy sees zeros in place of its demonstration.
+        instructions: task -> sentence.
+        weights: those of --clip-weights, see `clip.text_features`.
+        identity: of the weights that must be used, as a checkpoint names them; None: any.
+        device: of the features.
+        use_instruction: False gives zeros in place of every feature.
 
     Returns:
-        E booleans.
+        Task -> feature (text_dim,), and the identity of the weights.
     """
-    To, device = policy.config.n_obs_steps, text.device
+    features, identity = text_features(list(instructions.values()), weights, identity)
+    if not use_instruction:
+        features = torch.zeros_like(features)
+    return dict(zip(instructions, features.to(device))), identity
 
-    # One reference demonstration a rollout, held. All are drawn before any noise is; they are
-    # encoded one at a time, since they may differ in length.
-    demos = [sampler.demonstration(sampler.draw_episode(generator)) for _ in envs]
-    if blank:
-        demos = [{name: torch.zeros_like(x) for name, x in demo.items()} for demo in demos]
-    with torch.no_grad():
-        contexts = [policy.encode_demo(text[None], **demo) for demo in demos]
 
-    frames = [[env.reset(seed=seed)[0]] * To for env, seed in zip(envs, seeds)]  # the first, twice
-    success, running = [False] * len(envs), list(range(len(envs)))
-    while running:
-        points = np.stack([[f["point_cloud"] for f in frames[e]] for e in running])  # (E, To, N, 3)
-        state = np.stack([[f["agent_pos"] for f in frames[e]] for e in running])  # (E, To, S)
-        if on_chunk is not None:
-            on_chunk()
+# ---- Evaluation in worker processes --------------------------------------------------------------
 
-        chunks = sample_chunks(
-            policy,
-            torch.from_numpy(points).to(device),
-            torch.from_numpy(state).to(device),
-            [contexts[e] for e in running],
-            generator,
-        )  # (E, Ta, A)
+# What a worker process keeps between its jobs: policy and simulator; of the task that it worked on
+# last the sampler and the environments.
+worker_state: dict[str, Any] = {}
 
-        for e, chunk in zip(list(running), chunks):
-            for step, action in enumerate(chunk, start=1):
-                _, truncated, info = envs[e].advance(action)
-                success[e] = success[e] or info["success"]
-                if success[e] or truncated:  # a later step cannot undo a success
-                    running.remove(e)
-                    break
-                if step > len(chunk) - To:
-                    frames[e] = [*frames[e], envs[e].observe()][-To:]
+
+def evaluate_checkpoint(
+    checkpoint: str | Path,
+    simulator: Simulator,
+    recordings: dict[str, Path],
+    text: dict[str, Tensor],
+    *,
+    episodes: int = 20,
+    seed: int = EVALUATION_SEED,
+    workers: int | None = None,
+    device: str | torch.device = "cpu",
+    n_demonstrations: int | None = None,
+    zero_demonstration: bool = False,
+    known_goals: bool = False,
+    config_overrides: dict[str, Any] | None = None,
+) -> Successes:
+    """Rolls a checkpoint out on tasks of a simulator, in parallel processes.
+
+    Args:
+        checkpoint: a file of train.py or finetune.py.
+        simulator: it is pickled for the worker processes.
+        recordings: task -> file with its demonstrations.
+        text: task -> instruction feature, (text_dim,).
+        episodes: rollouts of each task; episode i has the goal of `evaluation_seed(seed, i)`.
+        seed: chooses goals, noise and reference demonstrations.
+        workers: processes; None: one a core.
+        device: where the policy runs.
+        n_demonstrations: use only the first so many of each recording; None: all.
+        zero_demonstration: the policy reads zeros in place of its demonstration.
+        known_goals: roll out on the demonstrations' goals, at most `episodes` of them, each once.
+        config_overrides: of the policy's configuration, see `inference_overrides`.
+
+    Returns:
+        Task -> E booleans, in the order of the episodes. They do not depend on `workers`.
+    """
+    jobs = []
+    for task, recording in recordings.items():
+        seeds = [evaluation_seed(seed, episode) for episode in range(episodes)]
+        if known_goals:
+            seeds = load_demonstrations(recording).meta["episode_seeds"][:n_demonstrations]
+            seeds = seeds[:episodes]
+        for start in range(0, len(seeds), EPISODES_A_JOB):
+            jobs.append(
+                {
+                    "task": task,
+                    "recording": recording,
+                    "n_demonstrations": n_demonstrations,
+                    "text": text[task].cpu().numpy(),  # tensors would be shared, not copied
+                    "seeds": seeds[start : start + EPISODES_A_JOB],
+                    "zero_demonstration": zero_demonstration,
+                }
+            )
+    successes = run_jobs(
+        rollout_job,
+        jobs,
+        workers=workers,
+        total=sum(len(job["seeds"]) for job in jobs),
+        description="evaluating",
+        setup=partial(prepare_worker, checkpoint, simulator, str(device), config_overrides or {}),
+    )
+
+    results: Successes = {task: [] for task in recordings}
+    for job, of_job in zip(jobs, successes):
+        results[job["task"]] += of_job
+    return results
+
+
+def prepare_worker(
+    checkpoint: str | Path, simulator: Simulator, device: str, config_overrides: dict[str, Any]
+) -> None:
+    """Loads the policy in a worker process."""
+    policy, _ = load_trained(checkpoint, device, **config_overrides)
+    worker_state.update(policy=policy, simulator=simulator, task=None)
+
+
+def rollout_job(
+    task: str,
+    recording: Path,
+    n_demonstrations: int | None,
+    text: np.ndarray,
+    seeds: list[int],
+    zero_demonstration: bool,
+) -> list[bool]:
+    """Rolls out the episodes of these seeds, of one task, in a worker process."""
+    policy = worker_state["policy"]
+    device = policy.normalizer.action_scale.device
+    if worker_state["task"] != task:
+        demonstrations = load_demonstrations(recording).take(n_demonstrations)
+        sampler = WindowSampler(demonstrations, policy.config, device=device)
+        worker_state.update(task=task, sampler=sampler, environments=[])
+    while len(worker_state["environments"]) < len(seeds):
+        worker_state["environments"].append(
+            worker_state["simulator"].make(task, policy.config.num_points)
+        )
+
+    success = rollout(
+        policy,
+        environments=worker_state["environments"][: len(seeds)],
+        seeds=seeds,
+        sampler=worker_state["sampler"],
+        text=torch.from_numpy(text).to(device),
+        generator=torch.Generator().manual_seed(seeds[0]),
+        zero_demonstration=zero_demonstration,
+    )
+    report_progress(task, len(seeds))
     return success
-
-
-def sample_chunks(
-    policy: DAMIPolicy,
-    points: Tensor,
-    state: Tensor,
-    contexts: Sequence,
-    generator: torch.Generator,
-) -> np.ndarray:
-    """Action chunks (E, Ta, A) for observations (E, To, N, 3), (E, To, S) and one context each."""
-    if contexts[0] is None:  # this architecture reads no task
-        return policy.sample_actions(points, state, None, generator).cpu().numpy()
-    if len({context[0].shape for context in contexts}) > 1:  # demonstrations of different lengths
-        each = [
-            policy.sample_actions(p[None], s[None], context, generator)
-            for p, s, context in zip(points, state, contexts)
-        ]
-        return torch.cat(each).cpu().numpy()
-    context = tuple(torch.cat(parts) for parts in zip(*contexts))
-    return policy.sample_actions(points, state, context, generator).cpu().numpy()
 
 
 # ---- Without a simulator: held-out episodes ------------------------------------------------------
 
 
-def hold_out(
-    recorded: dict[str, Demonstrations], n: int
-) -> tuple[dict[str, Demonstrations], dict[str, Demonstrations]]:
-    """Parts each recording, by task, into all but its last n episodes, and those; n = 0: no others.
-
-    Raises ValueError where nothing would be left to train on.
-    """
-    kept, held = {}, {}
-    for task, whole in recorded.items():
-        kept[task], heldout = data.hold_out(whole, n)
-        if heldout is not None:
-            held[task] = heldout
-    return kept, held
-
-
 @torch.no_grad()
 def action_error(
-    policy: DAMIPolicy, shown: WindowSampler, unseen: WindowSampler, text: Tensor, seed: int = 0
+    policy: DAMIPolicy,
+    train_sampler: WindowSampler,
+    heldout_sampler: WindowSampler,
+    text: Tensor,
+    seed: int = 0,
 ) -> tuple[float, float]:
     """How far drawn actions are from an expert's: mean absolute error, in the action's unit.
 
     Whole episodes are gone through as in a rollout, from one executed chunk of Ta actions to the
-    next, but the policy sees the expert's frames: so errors do not add up. The mean is over the
-    frames of all episodes and the A numbers of an action.
+    next, but the policy sees the expert's frames, so that errors do not add up. The mean is over
+    the frames of all held-out episodes and the A numbers of an action.
 
     Args:
         policy: in any mode.
-        shown: the episodes trained on; one of them is the reference demonstration.
-        unseen: the episodes to judge by.
+        train_sampler: of the episodes trained on; one of them is the reference demonstration.
+        heldout_sampler: of the episodes to judge by.
         text: instruction feature, (text_dim,).
-        seed: of references and noise.
+        seed: of reference demonstrations and noise.
 
     Returns:
-        The error, and that of always doing the mean action of `shown`, to compare it with.
+        The error, and the error of always doing the mean action of `train_sampler`.
     """
-    generator, errors, plain = torch.Generator().manual_seed(seed), [], []
+    generator = torch.Generator().manual_seed(seed)
+    device = text.device
     To, Ta = policy.config.n_obs_steps, policy.config.n_action_steps
-    for episode in unseen.episodes:
-        demo = shown.demonstration(shown.draw_episode(generator))
-        context = policy.encode_demo(text[None], **{k: x.to(text.device) for k, x in demo.items()})
+    mean_action = train_sampler.action.mean(dim=0)  # (A,)
+    errors, errors_of_mean = [], []
+    for episode in heldout_sampler.episodes:
+        demonstration = train_sampler.demonstration(train_sampler.sample_episode(generator))
+        demonstration = {name: x.to(device) for name, x in demonstration.items()}
+        context = policy.encode_demo(text[None], **demonstration)
+
         newest = torch.arange(episode.start, episode.stop, Ta)[:, None]  # (n, 1) frames
-        seen = (newest + torch.arange(1 - To, 1)).clamp(episode.start)  # (n, To)
-        done = newest + torch.arange(Ta)  # (n, Ta), the last of them perhaps beyond the episode
-        inside = done < episode.stop
-        points, state = unseen.points[seen].float(), unseen.state[seen]
-        both = points.to(text.device), state.to(text.device)
-        drawn = policy.sample_actions(*both, context, generator)  # (n, Ta, A)
-        acted = unseen.action[done[inside]]  # (frames, A)
-        errors.append((drawn.to(acted.device)[inside] - acted).abs().flatten())
-        plain.append((shown.action.mean(dim=0).to(acted.device) - acted).abs().flatten())
-    return torch.cat(errors).mean().item(), torch.cat(plain).mean().item()
+        observed = (newest + torch.arange(1 - To, 1)).clamp(episode.start)  # (n, To)
+        points = heldout_sampler.points[observed].float().to(device)  # (n, To, N, P)
+        state = heldout_sampler.state[observed].to(device)  # (n, To, S)
+        drawn = policy.sample_actions(points, state, context, generator)  # (n, Ta, A)
+
+        executed = newest + torch.arange(Ta)  # (n, Ta) frames; the last may be behind the episode
+        inside = executed < episode.stop
+        expert = heldout_sampler.action[executed[inside]]  # (frames, A)
+        errors.append((drawn.to(expert.device)[inside] - expert).abs().flatten())
+        errors_of_mean.append((mean_action.to(expert.device) - expert).abs().flatten())
+    return torch.cat(errors).mean().item(), torch.cat(errors_of_mean).mean().item()
 
 
-def judge(
-    folder: Path,
-    step: int,
+def evaluate_heldout(
     policy: DAMIPolicy,
-    shown: dict[str, WindowSampler],
-    unseen: dict[str, WindowSampler],
+    train_samplers: dict[str, WindowSampler],
+    heldout_samplers: dict[str, WindowSampler],
     text: dict[str, Tensor],
-) -> str:
-    """Logs the action errors on held-out episodes, of which there may be none.
-
-    Returns a table, also in held-out.md: a row a task, the errors at the first and last step that
-    was judged so far, and those of always doing the mean action.
-    """
-    if not unseen:
-        return ""
-    found = {task: action_error(policy, shown[task], unseen[task], text[task]) for task in unseen}
-    errors = {task: error for task, (error, _) in found.items()}
-    mean = float(np.mean(list(errors.values())))
-    scripts.log(folder, step=step, action_error=mean, action_errors=errors)
-
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    columns = {line["step"]: line["action_errors"] for line in lines if "action_errors" in line}
-    columns = {f"step {k}": columns[k] for k in sorted({min(columns), step})}
-    columns["the mean action"] = {task: error for task, (_, error) in found.items()}
-    rows = [[task, *(f"{errors[task]:.4f}" for errors in columns.values())] for task in found]
-    if len(rows) > 1:
-        means = [f"{np.mean(list(errors.values())):.4f}" for errors in columns.values()]
-        rows.append(["**mean**", *means])
-    table = format_table([["held-out action error", *columns], *rows])
-    write_text(folder / "held-out.md", f"{table}\n\nMean absolute error, in the action's unit.\n")
-    return table
-
-
-# ---- Evaluation in worker processes --------------------------------------------------------------
-
-loaded: dict[str, Any] = {}  # what a worker process keeps between jobs: policy and environments
-
-
-def load_policy(checkpoint: str, device: str, changed: dict[str, Any]) -> None:
-    """Sets up a worker process."""
-    loaded.update(policy=load_checkpoint(checkpoint, device, **changed)[0], task=None)
-
-
-def rollout_job(
-    task: str,
-    data: str,
-    n_demonstrations: int | None,
-    text: np.ndarray,
-    seeds: list[int],
-    blank: bool = False,
-) -> list[bool]:
-    """Rolls out the episodes of these seeds, of one task, in a worker process."""
-    policy = loaded["policy"]
-    device = policy.normalizer.action_scale.device
-    if loaded["task"] != task:
-        demonstrations = load_demonstrations(data).take(n_demonstrations)
-        sampler = WindowSampler(demonstrations, policy.config, device=device)
-        loaded.update(task=task, sampler=sampler, envs=[])
-    while len(loaded["envs"]) < len(seeds):
-        loaded["envs"].append(MetaWorldPointCloudEnv(task, policy.config.num_points))
-
-    def on_chunk() -> None:
-        if worker.stop.is_set():  # Ctrl-C in the starting process
-            raise InterruptedError("evaluation was interrupted")
-
-    envs, generator = loaded["envs"][: len(seeds)], torch.Generator().manual_seed(seeds[0])
-    text = torch.from_numpy(text).to(device)
-    success = rollout(policy, envs, seeds, loaded["sampler"], text, generator, on_chunk, blank)
-    worker.finished.put((task, len(seeds)))
-    return success
-
-
-def evaluate(
-    checkpoint: str | Path,
-    demonstrations: dict[str, Path],
-    text: dict[str, Tensor],
-    episodes: int = 20,
-    seed: int = 0,
-    workers: int | None = None,
-    device: str | torch.device = "cpu",
-    n_demonstrations: int | None = None,
-    blank: bool = False,
-    known_goals: bool = False,
-    **changed: Any,
-) -> Successes:
-    """Rolls a checkpoint out on Meta-World tasks in parallel processes.
-
-    Args:
-        checkpoint: a file of train.py or finetune.py.
-        demonstrations: task -> file with its demonstrations.
-        text: task -> instruction feature, (text_dim,).
-        episodes: rollouts a task; episode i has the goal of `evaluation_seed(seed, i)`.
-        seed: chooses goals, noise and reference demonstrations.
-        workers: processes, by default one a core.
-        device: where the policy runs.
-        n_demonstrations: use only the first so many of each file; None: all.
-        blank: the policy sees zeros in place of its demonstration.
-        known_goals: those of the demonstrations instead, at most `episodes` of them.
-        changed: of the policy's configuration, for the rollouts, see `scripts.inference`.
-
-    Returns:
-        task -> E booleans, in the order of the episodes. They do not depend on `workers`.
-    """
-    at_least(1, episodes=episodes)
-    jobs, total = [], 0
-    for task, path in demonstrations.items():
-        seeds = [evaluation_seed(seed, i) for i in range(episodes)]
-        if known_goals:
-            seeds = load_demonstrations(path).meta["episode_seeds"][:n_demonstrations][:episodes]
-        how = task, str(path), n_demonstrations, text[task].cpu().numpy()
-        starts = range(0, len(seeds), EPISODES_A_JOB)
-        jobs += [(*how, seeds[start : start + EPISODES_A_JOB], blank) for start in starts]
-        total += len(seeds)
-    setup = (load_policy, str(checkpoint), str(device), changed)
-    found = run_jobs(rollout_job, jobs, workers, total, "evaluating", setup)
-
-    results: Successes = {task: [] for task in demonstrations}
-    for (task, *_), successes in zip(jobs, found):
-        results[task] += successes
-    return results
-
-
-def evaluate_step(
-    folder: Path,
-    step: int,
-    settings: Any,
-    stop: scripts.StopRequest,
-    paths: dict[str, Path],
-    text: dict[str, Tensor],
-    *others: Any,
-) -> Successes | None:
-    """`evaluate` of a run's checkpoint where that is due, logged, unless it was done before.
-
-    `settings` are those of train.py, `others` come after `seed`. Ctrl-C stops it at once.
-    """
-    due = step == settings.steps or (step and step % settings.evaluate_every == 0)
-    if not settings.episodes or not due:
-        return None
-    for line in (folder / "metrics.jsonl").read_text().splitlines():
-        values = json.loads(line)
-        if values["step"] == step and "successes" in values:
-            return values["successes"]
-    protocol = settings.episodes, EVALUATION_SEED, *others
-    with stop.at_once():  # everything is saved
-        successes = evaluate(folder / f"ema-{step:05d}.pt", paths, text, *protocol)
-    scripts.log(folder, step=step, success=mean_success(successes), successes=successes)
-    return successes
+) -> dict[str, tuple[float, float]]:
+    """`action_error` of each task that has held-out episodes: (error, error of the mean action)."""
+    return {
+        task: action_error(policy, train_samplers[task], heldout_sampler, text[task])
+        for task, heldout_sampler in heldout_samplers.items()
+    }
 
 
 # ---- Animations ----------------------------------------------------------------------------------
@@ -393,244 +430,517 @@ def evaluate_step(
 FPS = 30
 
 
-def write_gif(
-    policy: DAMIPolicy, sampler: WindowSampler, text: Tensor, seed: int, path: str | Path
-) -> bool:
-    """Rolls out one episode and animates every second step: the picture, and what the policy sees.
+@dataclass(frozen=True)
+class Frame:
+    """A moment of a rollout, as an animation shows it."""
 
-    Returns whether the episode succeeded.
+    step: int
+    picture: np.ndarray  # (240, 240, 3) uint8
+    cloud: np.ndarray  # (N, 3), metres
+
+
+class FilmedEnvironment:
+    """An environment that keeps a frame before every second step, for `rollout`."""
+
+    def __init__(self, environment: Environment, on_step: Callable[[], Any]):
+        self.environment = environment
+        self.on_step = on_step
+        self.steps = 0
+        self.frames: list[Frame] = []
+
+    def begin(self, seed: int) -> None:
+        self.environment.begin(seed)
+
+    def observe(self) -> dict[str, np.ndarray]:
+        return self.environment.observe()
+
+    def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
+        if self.steps % 2 == 0:
+            self.film()
+        self.steps += 1
+        self.on_step()
+        return self.environment.advance(action)
+
+    def film(self) -> None:
+        """Keeps the present moment."""
+        cloud = positions(self.observe()["point_cloud"])
+        self.frames.append(Frame(self.steps, self.environment.render(), cloud))
+
+
+def write_animation(
+    policy: DAMIPolicy,
+    simulator: Simulator,
+    sampler: WindowSampler,
+    text: Tensor,
+    *,
+    seed: int,
+    path: str | Path,
+) -> bool:
+    """Rolls out one episode and animates it: the picture, and what the policy sees beside it.
+
+    Args:
+        policy: in evaluation mode.
+        simulator: has the sampler's task.
+        sampler: of the task's demonstrations, one of which is the reference.
+        text: instruction feature, (text_dim,).
+        seed: of goal, reference demonstration and noise: `evaluation_seed(seed, 0)`.
+        path: of the animation, .gif or .mp4; see `movie_writer`.
+
+    Returns:
+        Whether the episode succeeded.
     """
+    writer = movie_writer(path)
+    episode_seed = evaluation_seed(seed, 0)
+    with progress_bar(desc="rolling out", unit="step") as progress:
+        environment = FilmedEnvironment(
+            simulator.make(sampler.task, policy.config.num_points), on_step=progress.update
+        )
+        [success] = rollout(
+            policy,
+            environments=[environment],
+            seeds=[episode_seed],
+            sampler=sampler,
+            text=text,
+            generator=torch.Generator().manual_seed(episode_seed),
+        )
+    environment.film()  # how it ended
+    title = f"{sampler.task}: {'success' if success else 'failure'}"
+    animate(environment.frames, title, writer, path)
+    return success
+
+
+def animate(frames: Sequence[Frame], title: str, writer: Any, path: str | Path) -> None:
+    """Writes frames as an animation, with a writer of Matplotlib; the last one stays a while."""
     from matplotlib.animation import FuncAnimation
     from matplotlib.figure import Figure
 
-    writer = movie_writer(path)
-    env = MetaWorldPointCloudEnv(sampler.task, policy.config.num_points, render_mode="rgb_array")
-    frames, advance = [], env.advance
-
-    def film(action: np.ndarray) -> tuple:
-        if env.steps % 2 == 0:
-            frames.append((env.render(), env.cloud()))
-        progress.update()
-        return advance(action)
-
-    env.advance = film
-    goal = evaluation_seed(seed, 0)
-    generator = torch.Generator().manual_seed(goal)
-    with scripts.progress_bar(desc="rolling out", unit="step") as progress:
-        (success,) = rollout(policy, [env], [goal], sampler, text, generator)
-    frames.append((env.render(), env.cloud()))  # how it ended
-
-    clouds = np.concatenate([cloud for _, cloud in frames])
-    low, high = clouds.min(0), clouds.max(0)
+    clouds = np.concatenate([frame.cloud for frame in frames])
+    low, high = clouds.min(axis=0), clouds.max(axis=0)
     figure = Figure(figsize=(6, 3), layout="constrained")
     left = figure.add_subplot(1, 2, 1)
     right = figure.add_subplot(1, 2, 2, projection="3d")
 
-    def draw(index: int) -> None:
-        picture, cloud = frames[index]
+    def show(frame: Frame) -> None:
         left.clear()
-        right.clear()
-        left.imshow(picture)
+        left.imshow(frame.picture)
         left.set_axis_off()
-        left.set_title(f"{sampler.task}: {'success' if success else 'failure'}", fontsize=9)
-        right.scatter(*cloud.T, c=cloud[:, 2], cmap="viridis", vmin=low[2], vmax=high[2], s=9)
+        left.set_title(title, fontsize=9)
+
+        right.clear()
+        height = frame.cloud[:, 2]
+        right.scatter(*frame.cloud.T, c=height, vmin=low[2], vmax=high[2], cmap="viridis", s=9)
         right.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         right.set(xticklabels=[], yticklabels=[], zticklabels=[])
         right.set_box_aspect(high - low)
         right.view_init(elev=25, azim=-30)
-        step = min(2 * index, env.steps)
-        right.set_title(f"{policy.config.num_points} points, step {step}", fontsize=9)
+        right.set_title(f"{len(frame.cloud)} points, step {frame.step}", fontsize=9)
 
-    shown = [*range(len(frames)), *[len(frames) - 1] * 10]  # the end stays a while
-    animation = FuncAnimation(figure, draw, frames=shown)
-    with scripts.progress_bar(desc="drawing", unit="frame", total=len(shown)) as progress:
-        how = {"writer": writer, "dpi": 70, "progress_callback": lambda *_: progress.update()}
-        write_atomically(path, lambda name: animation.save(name, **how))
-    return success
+    shown = [*frames, *[frames[-1]] * 10]
+    animation = FuncAnimation(figure, show, frames=shown)
+
+    def save(temporary: Path) -> None:
+        with progress_bar(desc="drawing", unit="frame", total=len(shown)) as progress:
+            animation.save(
+                temporary,
+                writer=writer,
+                dpi=70,
+                progress_callback=lambda index, total: progress.update(),
+            )
+
+    write_atomically(path, save)
 
 
 def movie_writer(path: str | Path) -> Any:
-    """What writes a .gif, or an .mp4 where there is ffmpeg, or the package imageio-ffmpeg with it.
+    """Matplotlib's writer of a .gif, or of an .mp4 where there is ffmpeg or imageio-ffmpeg.
 
-    Raises ValueError for any other file, one of no folder, or where there is neither.
+    Raises UserError for a file of another kind, one of no folder, or where there is neither.
     """
     import matplotlib
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
-    path, problem = Path(path), "name it .gif or .mp4"
+    path = Path(path)
     if not path.resolve().parent.is_dir():
-        problem = "there is no such folder"
-    elif path.suffix == ".gif":
+        raise UserError(f"cannot write {path}: there is no such folder")
+    if path.suffix == ".gif":
         return PillowWriter(fps=FPS)
-    elif path.suffix == ".mp4":
-        with suppress(ImportError):
-            ffmpeg = import_module("imageio_ffmpeg").get_ffmpeg_exe()
-            matplotlib.rcParams["animation.ffmpeg_path"] = ffmpeg
-        if FFMpegWriter.isAvailable():
-            return FFMpegWriter(fps=FPS)
-        problem = "install ffmpeg or `pip install imageio-ffmpeg`, or name it .gif"
-    raise ValueError(f"cannot write {path}: {problem}")
+    if path.suffix != ".mp4":
+        raise UserError(f"cannot write {path}: name it .gif or .mp4")
+    with suppress(ImportError):
+        ffmpeg = import_module("imageio_ffmpeg").get_ffmpeg_exe()
+        matplotlib.rcParams["animation.ffmpeg_path"] = ffmpeg
+    if not FFMpegWriter.isAvailable():
+        raise UserError(
+            f"cannot write {path}: install ffmpeg or `pip install imageio-ffmpeg`, or name it .gif"
+        )
+    return FFMpegWriter(fps=FPS)
+
+
+# ---- Folders of results --------------------------------------------------------------------------
+
+# What evaluate.py and finetune.py leave in their folder.
+RESULTS = ["success.json", "success.md", "success.png", "held-out.md"]
+RESULTS += ["adapted.pt", "adapted-[0-9]*.pt"]
+RESULTS += ["config.json", "metrics.jsonl", "events.out.tfevents.*"]
+
+
+def claim_results(folder: Path, overwrite: bool) -> list[Path]:
+    """Makes a folder for results, and returns the old results in it, which are to be removed.
+
+    They are not removed here but once nothing more can be refused, so that a mistake costs nobody
+    their results. Raises UserError if there are any and `overwrite` is False, or if the folder
+    holds a training run, which is never overwritten.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.glob("ema-*.pt")) or (folder / "last.pt").exists():
+        raise UserError(f"{folder} holds a training run: choose another --out")
+    old = [path for name in RESULTS for path in folder.glob(name)]
+    if old and not overwrite:
+        raise UserError(f"{folder} already holds {old[0].name}: add --overwrite, or another --out")
+    return old
 
 
 # ---- Command line --------------------------------------------------------------------------------
 
 
+def add_inference_flags(parser: Any) -> None:
+    """Adds the flags of what may be different in a rollout than it was in training."""
+    parser.add_argument(
+        "--sampler", choices=("ddim", "dp3"), help="DDIM as published, or as DP3 runs it"
+    )
+    parser.add_argument("--n-action-steps", type=int, help="actions until the policy looks again")
+    parser.add_argument("--inference-steps", type=int, help="of the diffusion for each chunk")
+
+
+def inference_overrides(args: argparse.Namespace) -> dict[str, Any]:
+    """Those flags of `add_inference_flags` that were given, by the names of `PolicyConfig`."""
+    flags = {
+        "sampler": args.sampler,
+        "n_action_steps": args.n_action_steps,
+        "inference_steps": args.inference_steps,
+    }
+    return {name: value for name, value in flags.items() if value is not None}
+
+
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Measures success in Meta-World.")
+    parser = argparse.ArgumentParser(description="Measures success in a simulator.")
     add = parser.add_argument
     add("--checkpoint", nargs="+", help="files or run folders (default: the newest run's last)")
-    add("--suite", help="ml10 or ml45 (default: the checkpoint's, or ml10)")
+    add("--suite", help="such as ml10, ml45 (default: the checkpoint's, or ml10)")
     add("--split", choices=("base", "novel", "all"), default="base", help="which of its tasks")
     add("--task", nargs="+", help="only these tasks, of any suite")
     add("--data", default="data", help="folder of the demonstrations (default: data)")
     add("--demonstrations", type=int, default=10, help="demonstrations a task (default: 10)")
     add("--episodes", type=int, default=20, help="episodes a task (default: 20)")
+    add("--top", type=int, default=0, help="all checkpoints of a run, and the mean of the best TOP")
+    inputs = ("demonstration", "instruction")
     add(
-        "--top", type=int, default=0, help="all checkpoints of a run; also the mean of the best TOP"
+        "--swap", nargs="+", choices=inputs, default=[], help="measure also with another task's own"
     )
-    parts = {"nargs": "+", "choices": ("demonstration", "instruction"), "default": []}
-    add("--swap", **parts, help="measure also with these of another task")
-    scripts.add_inference_flags(add)
-    add("--without", **parts, help="leave these out: zeros in their place")
+    add("--without", nargs="+", choices=inputs, default=[], help="zeros in the place of these")
     add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
     add("--known-goals", action="store_true", help="those of the demonstrations, not new ones")
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
-    scripts.add_common_flags(add)
     add("--gif", metavar="FILE", help="animate one rollout instead, .gif or .mp4")
+    add_inference_flags(parser)
+    common.add_common_flags(parser)
     return parser.parse_args(argv)
 
 
-def choose_tasks(args: argparse.Namespace, suite: str, info: dict[str, Any]) -> list[str]:
-    """The tasks to measure: --task, the one a policy was adapted to, or those of the split."""
-    adapted = info.get("adapted_to")
-    if args.task and adapted and args.task != [adapted]:
-        raise ValueError(f"this policy was adapted to {adapted}, not to {' '.join(args.task)}")
-    if args.task or adapted:
-        return [check_task(task) for task in args.task or [adapted]]
-    if suite == "own":
-        raise ValueError("a policy of own recordings has no simulator to be measured in")
-    base, novel = suite_tasks(suite)
-    return {"base": base, "novel": novel, "all": base + novel}[args.split]
-
-
-def of_next_task(each: dict[str, Any]) -> dict[str, Any]:
-    """Every task gets what belongs to the next one, the last what belongs to the first."""
-    values = list(each.values())
-    return dict(zip(each, values[1:] + values[:1]))
-
-
-def main(argv: list[str] | None = None) -> None:
-    args = parse(argv)
-    at_least(1, demonstrations=args.demonstrations, episodes=args.episodes)
-    at_least(0, top=args.top)
-    evaluation_seed(args.seed, 0)  # refuses a seed out of range now rather than after collecting
+def check_flags(args: argparse.Namespace) -> None:
+    """Raises UserError for what can be refused before any file is read."""
+    for name, value, least in (
+        ("demonstrations", args.demonstrations, 1),
+        ("episodes", args.episodes, 1),
+        ("top", args.top, 0),
+    ):
+        if value < least:
+            raise UserError(f"--{name} is {value}: use at least {least}")
+    evaluation_seed(args.seed, args.episodes - 1)  # refuses what is out of range
     if args.gif:
-        movie_writer(args.gif)  # refuses a wrong name now
-    device = scripts.pick_device(args.device, args.threads)
-
-    # Which checkpoints: of each run the last, or all of them for the mean of the best
-    runs = [
-        checkpoints_of(path)
-        for path in args.checkpoint or [default_checkpoint(args.suite or "ml10")]
-    ]
-    for found in runs:
-        if args.top > len(found):
-            raise ValueError(f"{found[-1].parent} holds {len(found)} checkpoints, fewer than --top")
-    runs = [found if args.top else found[-1:] for found in runs]
-    labels = {path: f"{path.resolve().parent.name}/{path.stem}" for run in runs for path in run}
-    if len(set(labels.values())) < sum(map(len, runs)):
-        raise ValueError("two checkpoints have the same folder and file name: rename one's folder")
-    changed = scripts.inference(args)
-    policy, info = load_checkpoint(runs[0][-1], device, needs=TRAINED, **changed)
-
-    # Tasks, their demonstrations and instructions
-    suite = args.suite or info["suite"]
-    tasks = choose_tasks(args, suite, info)
-    if args.gif and len(tasks) > 1:
-        raise ValueError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
-    if args.gif and (args.known_goals or "demonstration" in args.without):
-        raise ValueError("--gif: leave out --known-goals, and --without demonstration")
-    if args.gif and "adapted_to" not in info and tasks[0] in suite_tasks(suite)[1]:
-        adapt = f"python finetune.py --task {tasks[0]}"
-        print(f"{tasks[0]} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
-    if args.swap and (len(tasks) < 2 or args.top):
-        raise ValueError("--swap needs the tasks of a split, and the last checkpoint alone")
+        movie_writer(args.gif)  # refuses what cannot be written
+        if args.known_goals or "demonstration" in args.without:
+            raise UserError("--gif: leave out --known-goals, and --without demonstration")
+    if args.swap and args.top:
+        raise UserError("--swap measures the last checkpoint alone: leave out --top")
     if args.swap and args.known_goals:
-        raise ValueError("--known-goals are those of a task's own demonstrations: leave out --swap")
-    for checkpoint in labels:
-        _, each = load_checkpoint(checkpoint, needs=TRAINED)
-        if each["text_weights"] != info["text_weights"]:
-            raise ValueError(f"{checkpoint} was made with text weights {each['text_weights']!r}")
-        if each.get("adapted_to", tasks[0]) != tasks[0] or ("adapted_to" in each and tasks[1:]):
-            raise ValueError(f"{checkpoint} was adapted to {each['adapted_to']}: measure it alone")
-        if scripts.is_told(each) != scripts.is_told(info):
-            raise ValueError(f"{checkpoint}: with --no-instruction or without, not both at once")
-    out = Path(args.out)
-    with nullcontext() if args.gif else scripts.locked(out):
-        old = [] if args.gif else scripts.claim_folder(out, args.overwrite)
-        paths = collect(tasks, args.data, args.demonstrations, workers=args.workers)
-        n, how = args.demonstrations, (args.clip_weights, info["text_weights"], device)
-        recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
-        told = scripts.is_told(info) and "instruction" not in args.without
-        text, identity = scripts.instruction_features(recorded, *how, told=told)
-        for file in old:
-            file.unlink()
+        raise UserError("--known-goals are those of a task's own demonstrations: leave out --swap")
 
-        if args.gif:
-            sampler = WindowSampler(recorded[tasks[0]], policy.config, device=device)
-            success = write_gif(policy, sampler, text[tasks[0]], args.seed, args.gif)
-            print(f"{tasks[0]}: {'success' if success else 'failure'}; wrote {args.gif}")
-            return
 
-        chosen = args.task or "adapted_to" in info
-        facts = {"title": " ".join(tasks) if chosen else f"{suite}, {args.split} tasks"}
-        facts |= {"episodes a task": args.episodes, "seed": args.seed, "text weights": identity}
-        facts |= scripts.report_facts("evaluate.py", argv, device) | changed
-        if args.known_goals:
-            facts["goals"] = "of the demonstrations, each once"
-        if args.without:
-            facts["without"] = " and ".join(args.without)
-        measure(args, suite, runs, labels, paths, text, device, facts)
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint to measure."""
+
+    path: Path
+    label: str  # its column in tables and charts: the run's folder and the file's name
+    policy: str  # as in PolicyConfig.policy
+    info: dict[str, Any]  # what the file says beside the weights, see TRAINED
+
+
+def choose_checkpoints(
+    paths: Sequence[str | Path], top: int, config_overrides: dict[str, Any]
+) -> list[list[Checkpoint]]:
+    """Of each run the checkpoints to measure: the last one, or all of them, the last one last.
+
+    Raises UserError for a run of fewer than `top` checkpoints, and for two of one label.
+    """
+    runs = []
+    for path in paths:
+        files = checkpoints_of(path)
+        if top > len(files):
+            raise UserError(f"{path} holds {len(files)} checkpoints, fewer than --top")
+        run = []
+        for file in files if top else files[-1:]:
+            policy, info = load_trained(file, **config_overrides)
+            label = f"{file.resolve().parent.name}/{file.stem}"
+            run.append(Checkpoint(file, label, policy.config.policy, info))
+        runs.append(run)
+
+    labels = [checkpoint.label for checkpoint in chain(*runs)]
+    if len(set(labels)) < len(labels):
+        raise UserError("two checkpoints have the same folder and file name: rename one's folder")
+    return runs
+
+
+def choose_tasks(
+    args: argparse.Namespace, simulator: Simulator, suite: str, adapted_to: str | None
+) -> list[str]:
+    """The tasks to measure: --task, the one a policy was adapted to, or those of the split."""
+    if args.task and adapted_to and args.task != [adapted_to]:
+        raise UserError(f"this policy was adapted to {adapted_to}, not to {' '.join(args.task)}")
+    if args.task or adapted_to:
+        tasks = args.task or [adapted_to]
+        for task in tasks:
+            check_task(simulator, task)
+        return tasks
+    base, novel = simulator.tasks(suite)
+    return {"base": base, "novel": novel, "all": [*base, *novel]}[args.split]
+
+
+def check_together(checkpoints: Sequence[Checkpoint], tasks: Sequence[str]) -> None:
+    """Raises UserError for checkpoints that cannot be measured alike on these tasks."""
+    first = checkpoints[0].info
+    for checkpoint in checkpoints:
+        info = checkpoint.info
+        path = checkpoint.path
+        if info["text_weights"] != first["text_weights"]:
+            raise UserError(f"{path} was made with text weights {info['text_weights']!r}")
+        if "adapted_to" in info and list(tasks) != [info["adapted_to"]]:
+            raise UserError(f"{path} was adapted to {info['adapted_to']}: measure it alone")
+        if reads_instruction(info) != reads_instruction(first):
+            raise UserError(f"{path}: with --no-instruction or without, not both at once")
+
+
+def group_tasks(tasks: Sequence[str], simulator: Simulator, suite: str) -> Parts:
+    """The means to report: of base and of novel tasks where there are both, else of all tasks."""
+    base, novel = simulator.tasks(suite)
+    parts = {
+        "mean of base": [task for task in tasks if task in base],
+        "mean of novel": [task for task in tasks if task in novel],
+    }
+    others = [task for task in tasks if task not in base and task not in novel]
+    if others or not all(parts.values()):
+        return {"mean": list(tasks)}
+    return parts
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A column of the report: what is rolled out, and what it is told of each task."""
+
+    label: str
+    checkpoint: Path
+    recordings: dict[str, Path]
+    text: dict[str, Tensor]
+
+
+def choose_measurements(
+    runs: list[list[Checkpoint]],
+    recordings: dict[str, Path],
+    text: dict[str, Tensor],
+    swap: Sequence[str],
+) -> list[Measurement]:
+    """Every checkpoint with each task's own inputs, and each run's last one with swapped ones."""
+    measurements = [
+        Measurement(checkpoint.label, checkpoint.path, recordings, text)
+        for checkpoint in chain(*runs)
+    ]
+    for run in runs:
+        last = run[-1]
+        for part in swap:
+            measurements.append(
+                Measurement(
+                    label=f"{last.label}, {part} of another task",
+                    checkpoint=last.path,
+                    recordings=of_next_task(recordings) if part == "demonstration" else recordings,
+                    text=of_next_task(text) if part == "instruction" else text,
+                )
+            )
+    return measurements
+
+
+def of_next_task(inputs: dict[str, Any]) -> dict[str, Any]:
+    """Gives every task what belongs to the next one, and the last what belongs to the first."""
+    values = list(inputs.values())
+    return dict(zip(inputs, [*values[1:], values[0]]))
+
+
+def mean_successes(
+    successes: dict[str, Successes], runs: list[list[Checkpoint]], parts: Parts, top: int
+) -> dict[str, str]:
+    """Means over runs, with their intervals: of the last checkpoint, and of the `top` best ones."""
+    means = {}
+    for name, tasks in parts.items():
+        rates = [  # of each run the success rate of each checkpoint, in percent
+            [mean_success({task: successes[c.label][task] for task in tasks}) for c in run]
+            for run in runs
+        ]
+        means[f"{name}, last checkpoint"] = mean_interval([of_run[-1] for of_run in rates])
+        if top:
+            best = [float(np.mean(sorted(of_run)[-top:])) for of_run in rates]
+            means[f"{name}, best {top} checkpoints"] = mean_interval(best)
+    return means
+
+
+def load_inputs(
+    args: argparse.Namespace,
+    simulator: Simulator,
+    tasks: Sequence[str],
+    info: dict[str, Any],
+    device: torch.device,
+) -> tuple[dict[str, Path], dict[str, Tensor], str]:
+    """Collects what is missing of the tasks' demonstrations, and encodes their instructions.
+
+    Returns task -> file of its demonstrations, task -> instruction feature (text_dim,), and the
+    identity of CLIP's weights. `info` is that of a checkpoint.
+    """
+    recordings = collect(
+        simulator, tasks, args.data, episodes=args.demonstrations, workers=args.workers
+    )
+    text, identity = instruction_features(
+        {task: load_demonstrations(path).instruction for task, path in recordings.items()},
+        weights=args.clip_weights,
+        identity=info["text_weights"],
+        device=device,
+        use_instruction=reads_instruction(info) and "instruction" not in args.without,
+    )
+    return recordings, text, identity
+
+
+def watch(
+    args: argparse.Namespace,
+    checkpoint: Checkpoint,
+    simulator: Simulator,
+    suite: str,
+    task: str,
+    device: torch.device,
+) -> None:
+    """--gif: animates one rollout."""
+    if "adapted_to" not in checkpoint.info and task in simulator.tasks(suite)[1]:
+        adapt = f"python finetune.py --task {task}"
+        print(f"{task} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
+    policy, info = load_trained(checkpoint.path, device, **inference_overrides(args))
+    recordings, text, _ = load_inputs(args, simulator, [task], info, device)
+    demonstrations = load_demonstrations(recordings[task]).take(args.demonstrations)
+    sampler = WindowSampler(demonstrations, policy.config, device=device)
+    success = write_animation(policy, simulator, sampler, text[task], seed=args.seed, path=args.gif)
+    print(f"{task}: {'success' if success else 'failure'}; wrote {args.gif}")
 
 
 def measure(
     args: argparse.Namespace,
+    argv: list[str] | None,
+    runs: list[list[Checkpoint]],
+    simulator: Simulator,
     suite: str,
-    runs: list[list[Path]],
-    labels: dict[Path, str],
-    paths: dict[str, Path],
-    text: dict[str, Tensor],
+    tasks: list[str],
     device: torch.device,
-    facts: dict[str, Any],
 ) -> None:
-    """Rolls out the checkpoints of all runs (path -> label), and reports."""
-    blank = "demonstration" in args.without
-    protocol = args.episodes, args.seed, args.workers, device, args.demonstrations, blank
-    protocol += (args.known_goals,)
-    changed = scripts.inference(args)
-    results, swapped = {}, {}
-    for checkpoint in labels:
-        results[checkpoint] = evaluate(checkpoint, paths, text, *protocol, **changed)
-        for part in args.swap:
-            inputs = {"demonstration": paths, "instruction": text}
-            inputs[part] = of_next_task(inputs[part])
-            label = f"{labels[checkpoint]}, {part} of another task"
-            swapped[label] = evaluate(checkpoint, *inputs.values(), *protocol, **changed)
+    """Rolls out the checkpoints of all runs, and writes and prints the report."""
+    out = Path(args.out)
+    info = runs[0][-1].info
+    old_results = claim_results(out, args.overwrite)
+    recordings, text, identity = load_inputs(args, simulator, tasks, info, device)
+    for file in old_results:
+        file.unlink()
 
-    for name, part in parts_of(list(paths), suite).items():
-        of_part = {path: {task: found[task] for task in part} for path, found in results.items()}
-        means = [[mean_success(of_part[path]) for path in run] for run in runs]
-        facts[f"{name}, last checkpoint"] = mean_interval([run[-1] for run in means])
-        if args.top:
-            best = [float(np.mean(sorted(run)[-args.top :])) for run in means]
-            facts[f"{name}, best {args.top} checkpoints"] = mean_interval(best)
-    columns = {labels[run[-1]]: results[run[-1]] for run in runs} | swapped
-    all_checkpoints = {labels[path]: found for path, found in results.items()} if args.top else None
-    print(f"\n{write_report(Path(args.out), columns, facts, suite, all_checkpoints)}\n")
-    for name, value in facts.items():
+    successes = {}
+    for measurement in choose_measurements(runs, recordings, text, args.swap):
+        successes[measurement.label] = evaluate_checkpoint(
+            checkpoint=measurement.checkpoint,
+            simulator=simulator,
+            recordings=measurement.recordings,
+            text=measurement.text,
+            episodes=args.episodes,
+            seed=args.seed,
+            workers=args.workers,
+            device=device,
+            n_demonstrations=args.demonstrations,
+            zero_demonstration="demonstration" in args.without,
+            known_goals=args.known_goals,
+            config_overrides=inference_overrides(args),
+        )
+
+    parts = group_tasks(tasks, simulator, suite)
+    by_name = args.task or "adapted_to" in info
+    provenance = {
+        "title": " ".join(tasks) if by_name else f"{suite}, {args.split} tasks",
+        "episodes a task": args.episodes,
+        "seed": args.seed,
+        "goals": "of the demonstrations, each once" if args.known_goals else "new",
+        "left out": " and ".join(args.without) or "nothing",
+        "text weights": identity,
+        **common.provenance("evaluate.py", argv, device),
+        **inference_overrides(args),
+        **mean_successes(successes, runs, parts, args.top),
+    }
+    earlier = {checkpoint.label for run in runs for checkpoint in run[:-1]}
+    table = write_report(
+        out,
+        {label: results for label, results in successes.items() if label not in earlier},
+        provenance,
+        parts=parts,
+        paper=paper_columns(suite, dict.fromkeys(run[-1].policy for run in runs)),
+        checkpoints=successes if args.top else None,
+    )
+    print(f"\n{table}\n")
+    for name, value in provenance.items():
         print(f"{name}: {value}")
 
 
+def main(argv: list[str] | None = None) -> None:
+    args = parse(argv)
+    check_flags(args)
+    device = common.pick_device(args.device, args.threads)
+
+    # Which checkpoints, in which simulator, on which tasks
+    paths = args.checkpoint or [default_checkpoint(args.suite or "ml10")]
+    runs = choose_checkpoints(paths, args.top, inference_overrides(args))
+    info = runs[0][-1].info
+    suite = args.suite or info["suite"]
+    if suite == "own":
+        raise UserError("a policy of own recordings has no simulator to be measured in")
+    simulator = simulator_of(suite)
+    tasks = choose_tasks(args, simulator, suite, info.get("adapted_to"))
+    check_together(list(chain(*runs)), tasks)
+    if args.swap and len(tasks) < 2:
+        raise UserError("--swap takes from another task of a split: leave out --task")
+
+    if args.gif:
+        if len(tasks) > 1:
+            raise UserError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
+        watch(
+            args,
+            checkpoint=runs[0][-1],
+            simulator=simulator,
+            suite=suite,
+            task=tasks[0],
+            device=device,
+        )
+        return
+    with common.locked(Path(args.out)):
+        measure(args, argv, runs=runs, simulator=simulator, suite=suite, tasks=tasks, device=device)
+
+
 if __name__ == "__main__":
-    command_line(main)
+    common.command_line(main, errors=(RecordingError, CheckpointError))

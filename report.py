@@ -1,47 +1,51 @@
-"""What is made of results: success rates with their intervals, tables, charts, reports.
+"""What is made of results: success rates with their intervals, tables, charts, pictures.
 
 85.0 [64.0, 94.8]     17 of 20 episodes, in percent, and Wilson's 95 % interval
 82.2 ± 1.9 (3 runs)   the mean of runs of several seeds, and Student's 95 % interval
+
+Nothing here knows a simulator or a policy: results are lists of successes by task, and whoever
+wants means of some of the tasks names them (`parts`).
+
+Letters: T frames, N points, E episodes.
 """
 
 import json
 import math
-import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data import write_atomically
-from scripts import format_table, write_text
-from simulator import SUITES, suite_tasks
-
-PAPER_RESULTS = Path(__file__).parent / "assets" / "paper_results.json"
+from common import format_table, read_json_lines
+from data import Demonstrations, positions, write_atomically, write_text
 
 Successes = dict[str, list[bool]]  # task -> one entry an episode
+Parts = dict[str, list[str]]  # what a mean is called -> the tasks that it is the mean of
+PaperColumns = dict[str, dict[str, float]]  # title -> task -> success rate in percent
 
 
 # ---- Numbers -------------------------------------------------------------------------------------
 
 
 def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
-    """Returns Wilson's 95 % interval of a success rate, as two fractions."""
-    from scipy.stats import binomtest  # comes with metaworld; takes a second to import
+    """Wilson's 95 % interval of a success rate, as two fractions."""
+    from scipy.stats import binomtest  # takes a second to import
 
     interval = binomtest(successes, episodes).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)
 
 
 def format_success(successes: int, episodes: int) -> str:
-    """`17 of 20` -> `85.0 [64.0, 94.8]`: percent, with the 95 % Wilson interval."""
+    """`17 of 20` -> `85.0 [64.0, 94.8]`: percent, with Wilson's 95 % interval."""
     low, high = wilson_interval(successes, episodes)
     return f"{100 * successes / episodes:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def pooled_success(results: Successes) -> str:
     """The episodes of all tasks together, as `format_success` writes them."""
-    episodes = [success for task in results.values() for success in task]
+    episodes = [success for of_task in results.values() for success in of_task]
     return format_success(sum(episodes), len(episodes))
 
 
@@ -51,7 +55,7 @@ def mean_success(results: Successes) -> float:
 
 
 def mean_interval(values: Sequence[float]) -> str:
-    """Mean over runs with Student's 95 % interval, in the unit of the values."""
+    """The mean over runs with Student's 95 % interval, in the unit of the values."""
     if len(values) == 1:
         return f"{values[0]:.1f} (one run)"
     from scipy.stats import t
@@ -60,82 +64,179 @@ def mean_interval(values: Sequence[float]) -> str:
     return f"{np.mean(values):.1f} ± {margin:.1f} ({len(values)} runs)"
 
 
-# ---- Tables and charts ---------------------------------------------------------------------------
+# ---- The paper's results -------------------------------------------------------------------------
+
+PAPER_RESULTS = Path(__file__).parent / "assets" / "paper_results.json"
+PAPER_NAMES = {  # PolicyConfig.policy -> what the paper's tables call it
+    "dami": "DAMI",
+    "dp3": "DP3",
+    "flow": "FlowPolicy",
+    "mamba": "Mamba",
+    "freq": "FreqPolicy",
+}
 
 
-def paper_success(suite: str | None, task: str) -> float | None:
-    """The paper's success rate of DAMI on a task in percent, if it reports one."""
-    tables = json.loads(PAPER_RESULTS.read_text())
-    for split in ("base", "novel"):
-        if task in tables.get(suite or "", {}).get(split, {}):
-            return tables[suite][split][task]["DAMI"]
-    return None
+def paper_columns(suite: str, policies: Iterable[str]) -> PaperColumns:
+    """What the paper reports of some policies on the tasks of a suite.
+
+    Args:
+        suite: "ml10" or "ml45"; the paper has nothing of any other.
+        policies: names as in `PolicyConfig.policy`; those that the paper does not have are skipped.
+
+    Returns:
+        "paper, DAMI" -> task -> success rate in percent, for base and novel tasks.
+    """
+    tables = json.loads(PAPER_RESULTS.read_text()).get(suite)
+    if tables is None:
+        return {}
+    rows = {**tables["base"], **tables["novel"]}  # task -> the paper's name of a policy -> percent
+    columns = {}
+    for policy in policies:
+        if policy in PAPER_NAMES:
+            name = PAPER_NAMES[policy]
+            columns[f"paper, {name}"] = {task: row[name] for task, row in rows.items()}
+    return columns
 
 
-def parts_of(tasks: Sequence[str], suite: str | None) -> dict[str, list[str]]:
-    """What to call the mean, and of which tasks; base and novel ones of a suite are told apart."""
-    split = zip(("base", "novel"), suite_tasks(suite) if suite in SUITES else ((), ()))
-    parts = {f"mean of {part}": [t for t in tasks if t in known] for part, known in split}
-    whole = all(parts.values()) and sum(map(len, parts.values())) == len(tasks)
-    return parts if whole else {"mean": list(tasks)}
+# ---- Tables --------------------------------------------------------------------------------------
 
 
-def success_table(columns: dict[str, Successes], suite: str | None = None) -> str:
-    """A Markdown table: a row a task, a column for each set of results, the paper's; the means."""
+def success_table(
+    columns: dict[str, Successes], parts: Parts | None = None, paper: PaperColumns | None = None
+) -> str:
+    """A Markdown table: a row for each task, and one for the mean of each part.
 
-    def row(name: str, tasks: Sequence[str]) -> list[str]:
-        cells = [pooled_success({t: results[t] for t in tasks}) for results in columns.values()]
-        known = [paper_success(suite, task) for task in tasks]
-        return [name, *cells, "" if None in known else f"{np.mean(known):.1f}"]
-
+    Args:
+        columns: title -> results; all of them of the same tasks.
+        parts: see `Parts`; by default there is one mean, that of all tasks. A single task has none.
+        paper: more columns, see `paper_columns`; those that have none of the tasks are left out.
+    """
     tasks = list(next(iter(columns.values())))
-    rows = [["task", *columns, "paper"], *(row(task, [task]) for task in tasks)]
+    paper = with_any_of(tasks, paper or {})
+
+    def row(title: str, of_tasks: Sequence[str]) -> list[str]:
+        cells = [pooled_success({t: results[t] for t in of_tasks}) for results in columns.values()]
+        for rates in paper.values():
+            known = [rates[task] for task in of_tasks if task in rates]
+            cells.append(f"{np.mean(known):.1f}" if len(known) == len(of_tasks) else "")
+        return [title, *cells]
+
+    rows = [["task", *columns, *paper]]
+    rows += [row(task, [task]) for task in tasks]
     if len(tasks) > 1:
-        rows += [row(f"**{name}**", part) for name, part in parts_of(tasks, suite).items()]
+        rows += [row(f"**{name}**", part) for name, part in (parts or {"mean": tasks}).items()]
     return format_table(rows)
 
 
-def draw_success(
-    columns: dict[str, Successes], path: Path, title: str, suite: str | None = None
+def with_any_of(tasks: Sequence[str], paper: PaperColumns) -> PaperColumns:
+    """Those of the paper's columns that have at least one of the tasks."""
+    return {title: rates for title, rates in paper.items() if any(task in rates for task in tasks)}
+
+
+def heldout_table(columns: dict[str, dict[str, float]]) -> str:
+    """A Markdown table of action errors on held-out episodes: a row for each task, and the mean.
+
+    `columns` are title -> task -> error, see `evaluate.evaluate_heldout`.
+    """
+    tasks = list(next(iter(columns.values())))
+    rows = [["held-out action error", *columns]]
+    for task in tasks:
+        rows.append([task, *(f"{errors[task]:.4f}" for errors in columns.values())])
+    if len(tasks) > 1:
+        means = [np.mean([errors[task] for task in tasks]) for errors in columns.values()]
+        rows.append(["**mean**", *(f"{mean:.4f}" for mean in means)])
+    return format_table(rows)
+
+
+def write_report(
+    folder: Path,
+    columns: dict[str, Successes],
+    provenance: dict[str, Any],
+    *,
+    parts: Parts | None = None,
+    paper: PaperColumns | None = None,
+    checkpoints: dict[str, Successes] | None = None,
+) -> str:
+    """Writes success.json, success.md and success.png to a folder, and returns the table.
+
+    Args:
+        folder: it is made if it does not exist.
+        columns, parts, paper: see `success_table`.
+        provenance: how the results were measured, name -> value; "title" is the chart's.
+        checkpoints: label -> results that were measured, too, and are kept in success.json only.
+    """
+    table = success_table(columns, parts, paper)
+    report = {"provenance": provenance, "successes": columns}
+    if checkpoints:
+        report["checkpoints"] = checkpoints
+    note = ", ".join(f"{name} {value}" for name, value in provenance.items())
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "success.json", json.dumps(report, indent=1))
+    write_text(
+        folder / "success.md",
+        f"{table}\n\nPercent of episodes, with Wilson's 95 % interval. {note}.\n",
+    )
+    plot_success(columns, folder / "success.png", provenance.get("title", "Success"), paper)
+    return table
+
+
+# ---- Charts --------------------------------------------------------------------------------------
+
+
+def plot_success(
+    columns: dict[str, Successes], path: Path, title: str, paper: PaperColumns | None = None
 ) -> None:
-    """A bar chart of success with Wilson intervals, a group a task, the paper's beside them."""
-    from matplotlib.figure import Figure
+    """Writes a bar chart of success with Wilson intervals, a group of bars for each task.
+
+    Arguments as of `success_table`; `path` is that of a PNG.
+    """
+    from matplotlib.figure import Figure  # takes a second to import
 
     tasks = list(next(iter(columns.values())))
-    groups = len(columns) + 1
+    paper = with_any_of(tasks, paper or {})
+    n_bars = len(columns) + len(paper)
+    places, width = np.arange(len(tasks)), 0.8 / n_bars
     figure = Figure(figsize=(max(4.5, 2 + 0.9 * len(tasks)), 3.6), layout="constrained")
     axes = figure.subplots()
-    x, width = np.arange(len(tasks)), 0.8 / groups
 
     for i, (label, results) in enumerate(columns.items()):
         rates = np.array([np.mean(results[task]) for task in tasks])
         bounds = [wilson_interval(sum(results[task]), len(results[task])) for task in tasks]
-        errors = 100 * np.abs(np.array(bounds).T - rates)  # (2, tasks)
-        style = {"capsize": 2, "error_kw": {"linewidth": 0.8}}
-        axes.bar(x + i * width, 100 * rates, width, yerr=errors, label=label, **style)
+        axes.bar(
+            places + i * width,
+            100 * rates,
+            width,
+            yerr=100 * np.abs(np.array(bounds).T - rates),  # (2, tasks)
+            label=label,
+            capsize=2,
+            error_kw={"linewidth": 0.8},
+        )
+    for i, (label, rates) in enumerate(paper.items(), start=len(columns)):
+        gray = 0.8 - 0.15 * (i - len(columns))
+        heights = [rates.get(task, 0) for task in tasks]
+        axes.bar(places + i * width, heights, width, color=str(gray), label=label)
 
-    paper = [paper_success(suite, task) for task in tasks]
-    if any(value is not None for value in paper):
-        heights = [value or 0 for value in paper]
-        axes.bar(x + len(columns) * width, heights, width, color="0.8", label="paper (on a GPU)")
-
-    axes.set_xticks(x + width * (groups - 1) / 2, tasks, rotation=30, ha="right")
+    axes.set_xticks(places + width * (n_bars - 1) / 2, tasks, rotation=30, ha="right")
     axes.set(ylabel="success, %", ylim=(0, 105), title=title)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(frameon=False, ncols=groups, loc="outside upper center", fontsize=8)
-    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
+    figure.legend(frameon=False, ncols=n_bars, loc="outside upper center", fontsize=8)
+    save_png(figure, path, dpi=120)
 
 
-def draw_curves(folder: Path) -> None:
-    """Draws curves.png of a run: the loss, its running mean, and success where measured."""
+def plot_curves(folder: Path) -> None:
+    """Writes curves.png of a run: the loss and its running mean, and what was measured meanwhile.
+
+    That is success, or else the action error on held-out episodes; it has an axis of its own on the
+    right. All of it is read from the run's metrics.jsonl.
+    """
     from matplotlib.figure import Figure
 
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    steps = np.array([line["step"] for line in lines if "loss" in line])
-    losses = np.array([line["loss"] for line in lines if "loss" in line])
-    of = {"success": "mean success on base tasks, %", "action_error": "held-out action error"}
-    measured = {name: [(line["step"], line[name]) for line in lines if name in line] for name in of}
-    name = "success" if measured["success"] else "action_error"
+    metrics = read_json_lines(folder / "metrics.jsonl")
+    steps = np.array([line["step"] for line in metrics if "loss" in line])
+    losses = np.array([line["loss"] for line in metrics if "loss" in line])
+    successes = [(line["step"], line["success"]) for line in metrics if "success" in line]
+    errors = [(line["step"], line["action_error"]) for line in metrics if "action_error" in line]
 
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots()
@@ -145,66 +246,103 @@ def draw_curves(folder: Path) -> None:
     axes.plot(steps[width - 1 :], mean, color="C0", label=f"mean of {width} steps")
     axes.set(xlabel="outer step", ylabel="loss (actions in [-1, 1])", yscale="log")
     axes.spines["top"].set_visible(False)
-    handles, labels = axes.get_legend_handles_labels()
-    if measured[name]:
+
+    handles = axes.get_lines()
+    if successes or errors:
         right = axes.twinx()
-        (line,) = right.plot(*zip(*measured[name]), "o-", color="C1")
-        right.set(ylabel=of[name], ylim=(0, 100 if name == "success" else None))
         right.spines["top"].set_visible(False)
-        handles, labels = [*handles, line], [*labels, f"{name.replace('_', ' ')} (right)"]
-    axes.legend(handles, labels, frameon=False)
-
-    path = folder / "curves.png"
-    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
-
-
-# ---- Reports -------------------------------------------------------------------------------------
-
-
-def write_report(
-    folder: Path,
-    columns: dict[str, Successes],
-    facts: dict[str, Any],
-    suite: str | None = None,
-    checkpoints: dict[str, Successes] | None = None,
-) -> str:
-    """Writes success.json (every episode, how it was measured), .md, .png; returns the table.
-
-    `checkpoints`: what else was measured and is only kept in success.json.
-    """
-    table = success_table(columns, suite)
-    note = ", ".join(f"{name} {value}" for name, value in facts.items())
-    report = {"facts": facts, "successes": columns}
-    if checkpoints:
-        report["checkpoints"] = checkpoints
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "success.json", json.dumps(report, indent=1))
-    text = f"{table}\n\nPercent of episodes, 95 % Wilson interval. {note}.\n"
-    write_text(folder / "success.md", text)
-    draw_success(columns, folder / "success.png", facts.get("title", "Success"), suite)
-    return table
+        if successes:
+            handles += right.plot(*zip(*successes), "o-", color="C1", label="success (right)")
+            right.set(ylabel="mean success on base tasks, %", ylim=(0, 100))
+        else:
+            handles += right.plot(*zip(*errors), "o-", color="C1", label="action error (right)")
+            right.set_ylabel("held-out action error")
+            right.set_ylim(bottom=0)
+    axes.legend(handles=handles, frameon=False)
+    save_png(figure, folder / "curves.png", dpi=120)
 
 
-def report_training(
-    folder: Path,
-    arguments: Any,
-    policy: str,
-    seconds: float,
-    facts: dict[str, Any],
-    successes: Successes | None,
+def save_png(figure: Any, path: str | Path, dpi: int) -> None:
+    """Writes a figure of Matplotlib, whole or not at all."""
+    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=dpi, format="png"))
+
+
+# ---- Pictures of recordings ----------------------------------------------------------------------
+
+
+def plot_demonstration(
+    demonstrations: Demonstrations, path: str | Path, episode: int = 0, columns: int = 6
 ) -> None:
-    """What stands at the end of a training: curves, success or held-out errors, what is next."""
-    draw_curves(folder)
-    if successes:
-        facts = facts | {"title": f"{arguments.suite}, base tasks, {arguments.preset}, {policy}"}
-        facts |= {"episodes a task": arguments.episodes}
-        facts |= {"training": f"{seconds / 60:.1f} min", "training seed": arguments.seed}
-        columns = {"last checkpoint": successes}
-        print(f"\n{write_report(folder, columns, facts, arguments.suite)}")
-    if (judged := folder / "held-out.md").exists():
-        print(f"\n{judged.read_text().rstrip()}")
-    files = ", ".join(sorted(path.name for path in folder.iterdir()))
-    suite = arguments.suite
-    new = "--data NEW.npz" if suite == "own" else f"--task novel --suite {suite}"
-    print(f"\n{folder} is finished: {files}")
-    print(f"next: python finetune.py {new} --checkpoint {shlex.quote(str(folder))}")
+    """Writes a picture of one episode: its clouds along time, colored by height, and its actions.
+
+    Positions in the state (hand and fingers) are red dots. The boxes `workspace` and `tcp_box` are
+    drawn where the recording's meta has them. Points with features are drawn by their positions.
+
+    Args:
+        demonstrations: a recording.
+        path: of a PNG.
+        episode: which of its episodes.
+        columns: how many clouds are drawn, from the first frame to the last.
+    """
+    from matplotlib.figure import Figure
+
+    frames, meta = demonstrations.episode(episode), demonstrations.meta
+    clouds = positions(demonstrations.points[frames]).astype(np.float32)  # (T, N, 3)
+    n_positions = meta.get("positions_in_state", 0)
+    poses = demonstrations.state[frames, : 3 * n_positions]
+    poses = poses.reshape(len(clouds), n_positions, 3)  # (T, positions, 3)
+    boxes = {name: np.array(meta[name]) for name in ("workspace", "tcp_box") if name in meta}
+    low, high = drawn_space([clouds, poses, *boxes.values()])
+
+    columns = min(columns, len(clouds))
+    if columns > 1:
+        figure = Figure(figsize=(max(2.6 * columns, 8), 6), layout="constrained")
+        grid = figure.add_gridspec(2, columns, height_ratios=(1.5, 1))
+    else:
+        figure = Figure(figsize=(8, 9), layout="constrained")
+        grid = figure.add_gridspec(2, 1, height_ratios=(5, 1))
+
+    for column, t in enumerate(np.linspace(0, len(clouds) - 1, columns).round().astype(int)):
+        axes = figure.add_subplot(grid[0, column], projection="3d", computed_zorder=False)
+        height = clouds[t, :, 2]
+        axes.scatter(*clouds[t].T, c=height, vmin=low[2], vmax=high[2], cmap="viridis", s=2)
+        axes.scatter(*poses[t].T, c="red", s=14)
+        plot_box(axes, boxes.get("workspace"), color="black")
+        plot_box(axes, boxes.get("tcp_box"), color="red")
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        axes.set_title(f"frame {t}")
+        axes.set_box_aspect(high - low, zoom=1.3 if columns > 1 else 1)
+        axes.view_init(35, -30)
+        axes.tick_params(labelsize=5, pad=-3)
+
+    axes = figure.add_subplot(grid[1, :])
+    for index, values in enumerate(demonstrations.action[frames].T):
+        axes.plot(values, marker=".", label=f"action {index}")
+    axes.set(xlabel="frame", ylabel="action")
+    axes.legend(loc="upper right", ncols=4)
+    title = f"{demonstrations.task}, episode {episode}: {demonstrations.instruction}"
+    figure.suptitle(title.replace("$", r"\$"))  # or Matplotlib would typeset a formula
+    save_png(figure, path, dpi=110)
+
+
+def drawn_space(places: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The corners (3,) and (3,) of the box that arrays (..., 3) fill.
+
+    Each side is at least a tenth of the longest one, and at least 0.1 mm long, so that a plane and
+    a single point can be drawn, too.
+    """
+    everything = np.concatenate([x.reshape(-1, 3) for x in places])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    longest = max((high - low).max(), 1e-3)
+    half = np.maximum(high - low, 0.1 * longest) / 2
+    middle = (low + high) / 2
+    return middle - half, middle + half
+
+
+def plot_box(axes: Any, corners: np.ndarray | None, color: str) -> None:
+    """Draws the twelve edges of a box that is given by two corners (2, 3); None: there is none."""
+    if corners is None:
+        return
+    for a, b in combinations(product(*corners.T), 2):
+        if np.equal(a, b).sum() == 2:  # they differ along one axis: an edge
+            axes.plot(*zip(a, b), color=color, lw=0.5)

@@ -7,18 +7,18 @@ The error is `evaluate.action_error`, the mean over the base tasks of ML10.
 """
 
 import argparse
-from functools import cache
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
-import torch
 
-import scripts
-from data import load_demonstrations
-from evaluate import TRAINED, action_error
-from scripts import checkpoints_of, command_line, load_checkpoint
-from simulator import suite_tasks
+import common
+import evaluate
+from data import RecordingError, WindowSampler, load_demonstrations
+from model import CheckpointError
+from simulator import simulator_of
+
+SUITE = "ml10"
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -28,26 +28,29 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--unseen", default="data-unseen", help="folder of those to judge by")
     parser.add_argument("--threads", type=int, help="of PyTorch")
     args = parser.parse_args(argv)
-    scripts.pick_device("cpu", args.threads)
-    tasks = suite_tasks("ml10")[0]
-    seen, unseen = (
-        {task: load_demonstrations(Path(folder) / f"{task}.npz") for task in tasks}
-        for folder in (args.data, args.unseen)
-    )
+    common.pick_device("cpu", args.threads)
+    tasks, _ = simulator_of(SUITE).tasks(SUITE)
+    seen = {task: load_demonstrations(Path(args.data) / f"{task}.npz") for task in tasks}
+    unseen = {task: load_demonstrations(Path(args.unseen) / f"{task}.npz") for task in tasks}
+    instructions = {task: recorded.instruction for task, recorded in seen.items()}
 
-    @cache
-    def features(identity: str) -> dict[str, torch.Tensor]:
-        return scripts.instruction_features(seen, None, identity, "cpu")[0]
-
+    texts = {}  # identity of text weights -> task -> feature
     rows = [["checkpoint", "action error", "of the mean action"]]
-    for path in chain(*map(checkpoints_of, args.checkpoints)):
-        policy, info = load_checkpoint(path, needs=TRAINED)
-        shown, held = (scripts.windows(part, policy.config) for part in (seen, unseen))
-        text = features(info["text_weights"])
-        errors = [action_error(policy, shown[task], held[task], text[task]) for task in tasks]
-        rows.append([str(path), *(f"{mean:.4f}" for mean in np.mean(errors, axis=0))])
-    print(scripts.format_table(rows))
+    for path in chain.from_iterable(evaluate.checkpoints_of(path) for path in args.checkpoints):
+        policy, info = evaluate.load_trained(path)
+        identity = info["text_weights"]
+        if identity not in texts:
+            texts[identity], _ = evaluate.instruction_features(instructions, None, identity, "cpu")
+        errors = evaluate.evaluate_heldout(
+            policy,
+            {task: WindowSampler(seen[task], policy.config) for task in tasks},
+            {task: WindowSampler(unseen[task], policy.config) for task in tasks},
+            texts[identity],
+        )
+        means = np.mean(list(errors.values()), axis=0)  # of the policy, of the mean action
+        rows.append([str(path), *(f"{mean:.4f}" for mean in means)])
+    print(common.format_table(rows))
 
 
 if __name__ == "__main__":
-    command_line(main)
+    common.command_line(main, errors=(RecordingError, CheckpointError))
