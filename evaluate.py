@@ -201,22 +201,6 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
     return SHIPPED_CHECKPOINT
 
 
-def load_trained(
-    path: str | Path, device: str | torch.device = "cpu", **config_overrides: Any
-) -> tuple[DAMIPolicy, dict[str, Any]]:
-    """Loads a file of train.py or finetune.py, as `model.load` does.
-
-    Returns (policy in evaluation mode, what else the file says). Raises CheckpointError for a file
-    that does not say how it was trained, see `TRAINED`.
-    """
-    policy, info = model.load(path, device, **config_overrides)
-    missing = [name for name in TRAINED if name not in info]
-    if missing:
-        lacks = ", ".join(missing)
-        raise CheckpointError(f"{path} is no file of train.py or finetune.py: it lacks {lacks}")
-    return policy, info
-
-
 def reads_instruction(info: dict[str, Any]) -> bool:
     """Whether a checkpoint's policy is given its instruction: unless it was adapted without."""
     return info.get("adaptation", {}).get("instruction", True)
@@ -324,7 +308,7 @@ def prepare_worker(
     checkpoint: str | Path, simulator: Simulator, device: str, config_overrides: dict[str, Any]
 ) -> None:
     """Loads the policy in a worker process."""
-    policy, _ = load_trained(checkpoint, device, **config_overrides)
+    policy, _ = model.load(checkpoint, device, needs=TRAINED, **config_overrides)
     worker_state.update(policy=policy, simulator=simulator, task=None)
 
 
@@ -691,7 +675,7 @@ def choose_checkpoints(
             raise UserError(f"{path} holds {len(files)} checkpoints, fewer than --top")
         run = []
         for file in files if top else files[-1:]:
-            policy, info = load_trained(file, **config_overrides)
+            policy, info = model.load(file, needs=TRAINED, **config_overrides)
             label = f"{file.resolve().parent.name}/{file.stem}"
             run.append(Checkpoint(file, label, policy.config.policy, info))
         runs.append(run)
@@ -839,7 +823,7 @@ def watch(
     if "adapted_to" not in checkpoint.info and task in simulator.tasks(suite)[1]:
         adapt = f"python finetune.py --task {task}"
         print(f"{task} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
-    policy, info = load_trained(checkpoint.path, device, **inference_overrides(args))
+    policy, info = model.load(checkpoint.path, device, **inference_overrides(args))
     recordings, text, _ = load_inputs(args, simulator, [task], info, device)
     demonstrations = load_demonstrations(recordings[task]).take(args.demonstrations)
     sampler = WindowSampler(demonstrations, policy.config, device=device)
