@@ -201,6 +201,13 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
     return SHIPPED_CHECKPOINT
 
 
+def load_trained(
+    path: str | Path, device: str | torch.device = "cpu", **config_overrides: Any
+) -> tuple[DAMIPolicy, dict[str, Any]]:
+    """`model.load` of a file of train.py or finetune.py; CheckpointError for any other policy."""
+    return model.load(path, device, needs=TRAINED, **config_overrides)
+
+
 def reads_instruction(info: dict[str, Any]) -> bool:
     """Whether a checkpoint's policy is given its instruction: unless it was adapted without."""
     return info.get("adaptation", {}).get("instruction", True)
@@ -308,7 +315,7 @@ def prepare_worker(
     checkpoint: str | Path, simulator: Simulator, device: str, config_overrides: dict[str, Any]
 ) -> None:
     """Loads the policy in a worker process."""
-    policy, _ = model.load(checkpoint, device, needs=TRAINED, **config_overrides)
+    policy, _ = load_trained(checkpoint, device, **config_overrides)
     worker_state.update(policy=policy, simulator=simulator, task=None)
 
 
@@ -675,7 +682,7 @@ def choose_checkpoints(
             raise UserError(f"{path} holds {len(files)} checkpoints, fewer than --top")
         run = []
         for file in files if top else files[-1:]:
-            policy, info = model.load(file, needs=TRAINED, **config_overrides)
+            policy, info = load_trained(file, **config_overrides)
             label = f"{file.resolve().parent.name}/{file.stem}"
             run.append(Checkpoint(file, label, policy.config.policy, info))
         runs.append(run)
@@ -823,7 +830,7 @@ def watch(
     if "adapted_to" not in checkpoint.info and task in simulator.tasks(suite)[1]:
         adapt = f"python finetune.py --task {task}"
         print(f"{task} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
-    policy, info = model.load(checkpoint.path, device, **inference_overrides(args))
+    policy, info = load_trained(checkpoint.path, device, **inference_overrides(args))
     recordings, text, _ = load_inputs(args, simulator, [task], info, device)
     demonstrations = load_demonstrations(recordings[task]).take(args.demonstrations)
     sampler = WindowSampler(demonstrations, policy.config, device=device)

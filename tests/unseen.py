@@ -14,7 +14,6 @@ import numpy as np
 
 import common
 import evaluate
-import model
 from data import RecordingError, WindowSampler, load_demonstrations
 from model import CheckpointError
 from simulator import simulator_of
@@ -38,7 +37,7 @@ def main(argv: list[str] | None = None) -> None:
     texts = {}  # identity of text weights -> task -> feature
     rows = [["checkpoint", "action error", "of the mean action"]]
     for path in chain.from_iterable(evaluate.checkpoints_of(path) for path in args.checkpoints):
-        policy, info = model.load(path, needs=evaluate.TRAINED)
+        policy, info = evaluate.load_trained(path)
         identity = info["text_weights"]
         if identity not in texts:
             texts[identity], _ = evaluate.instruction_features(instructions, None, identity, "cpu")
