@@ -1,9 +1,9 @@
 """What better eyes, or another constant, would buy: a command of the repository in another world.
 
     python -m tests.oracle positions simulator.py --data data-positions
-    python -m tests.oracle positions train.py --data data-positions --out runs/positions
-    python -m tests.oracle positions evaluate.py --data data-positions --checkpoint runs/positions
-    python -m tests.oracle pixels train.py --data data-pixels --out runs/pixels
+    python -m tests.oracle positions train.py --suite ml10 --data data-positions --out runs/oracle
+    python -m tests.oracle positions evaluate.py --data data-positions --checkpoint runs/oracle
+    python -m tests.oracle pixels train.py --suite ml10 --data data-pixels --out runs/pixels
 
 `positions`: the state also holds where the object and the goal truly are. `pixels`: the camera
 casts four times as many rays. Recordings, and checkpoints, are of one of these two.
@@ -14,19 +14,19 @@ casts four times as many rays. Recordings, and checkpoints, are of one of these 
 import argparse
 import shlex
 import sys
-from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
 from torch.optim.swa_utils import AveragedModel
 
-import baselines
+import common
 import data
 import metaworld_env
-import scripts
 import train
+from clip import TextWeightsError
+from data import RecordingError
 from metaworld_env import MetaWorldPointCloudEnv
-from scripts import command_line
+from model import CheckpointError
 
 OBJECT, GOAL = slice(4, 7), slice(-3, None)  # in what Meta-World tells its experts
 
@@ -37,15 +37,12 @@ def positions() -> None:
 
     def observe_more(env: MetaWorldPointCloudEnv) -> dict[str, np.ndarray]:
         observation = observe(env)
-        positions = [env.expert_observation[OBJECT], env.expert_observation[GOAL]]
-        state = np.concatenate([observation["agent_pos"], *positions])  # (9 + 6,)
+        object_position, goal = env.expert_observation[OBJECT], env.expert_observation[GOAL]
+        state = np.concatenate([observation["agent_pos"], object_position, goal])  # (9 + 6,)
         return {"point_cloud": observation["point_cloud"], "agent_pos": state.astype(np.float32)}
 
     MetaWorldPointCloudEnv.observe = observe_more
     metaworld_env.RECIPE["positions_in_state"] += 2
-    for presets in baselines.PRESETS.values():
-        for name, config in presets.items():
-            presets[name] = replace(config, state_dim=config.state_dim + 6)
 
 
 def pixels() -> None:
@@ -80,13 +77,15 @@ def main() -> None:
     parser.add_argument("flags", nargs=argparse.REMAINDER, help="the command's")
     args = parser.parse_args()
     WORLDS[args.world]()
-    facts = scripts.report_facts
+
+    # Results name this command, and not the one that it runs.
+    provenance = common.provenance
     command = shlex.join(["python", "-m", "tests.oracle", *sys.argv[1:]])
-    scripts.report_facts = lambda *how: facts(*how) | {"command": command}
+    common.provenance = lambda *arguments: {**provenance(*arguments), "command": command}
     import_module(args.command.removesuffix(".py")).main(args.flags)
 
 
 if __name__ == "__mp_main__":  # a worker process of `main` lives in the same world
     WORLDS[sys.argv[1]]()
 if __name__ == "__main__":
-    command_line(main)
+    common.command_line(main, errors=(RecordingError, CheckpointError, TextWeightsError))
