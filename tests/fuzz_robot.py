@@ -25,15 +25,15 @@ def fuzz_robot(seed: int, rounds: int = 8) -> tuple[list[float], list[float], st
     """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=6)
-    box = {"tcp_low_m": [-1.2, -1.5, -0.7], "tcp_high_m": [0.8, 0.5, 1.3]}
-    box |= {"crop_low_m": [-1, -1, -1], "crop_high_m": [1, 1, 1]}
     with Emulator() as emulator:
-        ports = {f"{name}_port": port for name, port in emulator.ports.items()}
-        speeds = {"max_speed_m_s": rng.uniform(0.05, 0.5), "max_speed_rad_s": rng.uniform(0.1, 1)}
         settings = robot.Settings(
-            **box,
-            **ports,
-            **speeds,
+            **{f"{name}_port": port for name, port in emulator.ports.items()},
+            tcp_low_m=[-1.2, -1.5, -0.7],
+            tcp_high_m=[0.8, 0.5, 1.3],
+            crop_low_m=[-1, -1, -1],
+            crop_high_m=[1, 1, 1],
+            max_speed_m_s=rng.uniform(0.05, 0.5),
+            max_speed_rad_s=rng.uniform(0.1, 1),
             camera_to_base=np.eye(4, dtype=int).tolist(),
             servo_lookahead_s=rng.uniform(0.03, 0.2),
             max_lag_m=0.12,
