@@ -135,6 +135,13 @@ def test_a_recording_is_what_the_expert_saw_and_did(recording):
         assert success.index(True) == recorded.meta["success_frames"][index] > 0
 
 
+def test_points_keep_their_colours(tmp_path):
+    path = tmp_path / "touch-green.npz"
+    simulator.collect_task(ToySimulator(colored=True), path.stem, path, episodes=1, seed=0)
+    points = load_demonstrations(path).points
+    assert points.shape == (12, 64, 6) and (points[..., 3:] == (0, 1, 0)).all()
+
+
 class HardEnvironment(ToyEnvironment):
     """Its expert moves only in the last of every so many seeds."""
 
