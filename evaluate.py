@@ -204,17 +204,8 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
 def load_trained(
     path: str | Path, device: str | torch.device = "cpu", **config_overrides: Any
 ) -> tuple[DAMIPolicy, dict[str, Any]]:
-    """Loads a file of train.py or finetune.py, as `model.load` does.
-
-    Returns (policy in evaluation mode, what else the file says). Raises CheckpointError for a file
-    that does not say how it was trained, see `TRAINED`.
-    """
-    policy, info = model.load(path, device, **config_overrides)
-    missing = [name for name in TRAINED if name not in info]
-    if missing:
-        lacks = ", ".join(missing)
-        raise CheckpointError(f"{path} is no file of train.py or finetune.py: it lacks {lacks}")
-    return policy, info
+    """`model.load` of a file of train.py or finetune.py; CheckpointError for any other policy."""
+    return model.load(path, device, needs=TRAINED, **config_overrides)
 
 
 def reads_instruction(info: dict[str, Any]) -> bool:

@@ -63,14 +63,14 @@ class Environment(Protocol):
 class Simulator(Protocol):
     """A simulator's tasks, and how to make their environments.
 
-    It is sent to worker processes: an object of a module's class, small, that holds no environment.
+    It is pickled for worker processes: it is small, and its class stands in a module.
     """
 
     name: str
-    instructions: dict[str, str]  # task -> what the robot is told to do
-    recipe: dict[str, Any]  # of recordings, for their meta: at least "simulator" and "num_points"
-    packages: Sequence[str]  # those whose versions a recording's meta tells
-    episode_steps: int  # after so many an episode is truncated
+    instructions: dict[str, str]  # task -> what the robot is told; its order decides the seeds
+    recipe: dict[str, Any]  # how recordings are made: "simulator" (the name), "num_points", ...
+    packages: Sequence[str]  # names of those whose versions stand in a recording
+    episode_steps: int  # after so many steps an episode is truncated
 
     def tasks(self, suite: str) -> tuple[list[str], list[str]]:
         """Returns a suite's (base, novel) tasks: those to train on, and those to adapt to."""
@@ -139,8 +139,8 @@ def seeds_of_a_task(simulator: Simulator) -> int:
 def demonstration_seed(simulator: Simulator, task: str, seed: int, attempt: int) -> int:
     """Returns the episode seed of one attempt at a demonstration, below 10**8.
 
-    It differs from task to task: some draw their goals alike, and would show the same ten. Raises
-    ValueError for an attempt that would have a seed of the next task.
+    No two tasks share a seed: some tasks draw their goals alike, so that their demonstrations would
+    have the same goals. Raises ValueError for an attempt that would have a seed of the next task.
     """
     seeds = seeds_of_a_task(simulator)
     if not 0 <= attempt < seeds:
@@ -152,11 +152,11 @@ def demonstration_seed(simulator: Simulator, task: str, seed: int, attempt: int)
     return episode_seed(seed, first + attempt)
 
 
-# ---- Recordings of simulators --------------------------------------------------------------------
+# ---- How a recording was made --------------------------------------------------------------------
 
 
 def made_by_simulator(demonstrations: Demonstrations) -> bool:
-    """Whether a recording was made by `collect`; otherwise it is somebody's own."""
+    """Whether a recording was made by `collect`, and not by a robot or by other software."""
     return "simulator" in demonstrations.meta
 
 
@@ -243,7 +243,10 @@ def collect(
 def missing_tasks(
     simulator: Simulator, paths: dict[str, Path], episodes: int, seed: int
 ) -> list[str]:
-    """Returns the tasks whose file (task -> path) is not there, or holds too few episodes."""
+    """Returns the tasks whose file is not there or holds too few episodes; paths: task -> file.
+
+    Raises UserError for a file that was made in another way.
+    """
     missing = []
     for task, path in paths.items():
         if not path.exists():
@@ -381,6 +384,12 @@ class ModuleWithOldNames(types.ModuleType):
             metaworld_env.MetaWorldPointCloudEnv.__init__.__kwdefaults__["episode_steps"] = value
         else:
             super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:  # how pytest's monkeypatch undoes it
+        if name == "EPISODE_STEPS":
+            self.EPISODE_STEPS = 200
+        else:
+            super().__delattr__(name)
 
 
 sys.modules[__name__].__class__ = ModuleWithOldNames

@@ -60,7 +60,15 @@ from data import (
     write_text,
 )
 from maml import meta_gradient
-from model import TASK_INPUTS, CheckpointError, DAMIPolicy, PolicyConfig, ema_model, split
+from model import (
+    TASK_INPUTS,
+    CheckpointError,
+    ConfigError,
+    DAMIPolicy,
+    PolicyConfig,
+    ema_model,
+    split,
+)
 from report import Successes
 from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
 
@@ -619,7 +627,7 @@ def choose_architecture(args: argparse.Namespace, preset: str) -> PolicyConfig:
     try:
         config = replace(config, **{name: x for name, x in flags.items() if x is not None})
         build_empty(config)
-    except ValueError as error:
+    except ConfigError as error:
         raise UserError(str(error)) from error
     return config
 

@@ -31,7 +31,7 @@ from report import (
     pooled_success,
     wilson_interval,
 )
-from scripts import format_table, load_checkpoint, save_checkpoint
+from common import format_table
 from simulator import suite_tasks
 from tests.runs import AGAIN, REPORTS
 

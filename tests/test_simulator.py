@@ -157,9 +157,10 @@ class HardSimulator(ToySimulator):
 
 
 def test_failed_attempts_are_not_kept_but_counted(tmp_path):
-    path = collect(HardSimulator(), [TASK], tmp_path, episodes=2, workers=1)[TASK]
+    path = collect(HardSimulator(), [TASK], tmp_path, episodes=2, seed=4, workers=1)[TASK]
     recorded = load_demonstrations(path)
-    assert recorded.meta["episode_seeds"] == [1, 3] and len(recorded) == 2
+    assert recorded.meta["episode_seeds"] == [400_001, 400_003] and len(recorded) == 2
+    assert recorded.meta["seed"] == 4
     assert recorded.meta["expert_success_rate"] == 0.5
 
 
