@@ -16,7 +16,7 @@ from toy_simulator import ToyEnvironment, ToySimulator
 
 import simulator
 from common import UserError, command_line
-from data import load_demonstrations, save_demonstrations
+from data import RecordingError, load_demonstrations, save_demonstrations
 from metaworld_env import MetaWorld
 from simulator import collect, demonstration_seed, evaluation_seed, made_by_simulator
 
@@ -281,6 +281,6 @@ def test_what_the_user_gets_wrong_ends_in_one_line_and_exit_code_2(
     Path("damaged").mkdir()
     Path("damaged/reach.npz").write_text("no recording")
     with pytest.raises(SystemExit) as end:
-        command_line(lambda: simulator.main(argv), errors=(ValueError,))
+        command_line(lambda: simulator.main(argv), errors=(RecordingError,))
     error = capsys.readouterr().err
     assert end.value.code == 2 and message in error and error.count("\n") == 1
