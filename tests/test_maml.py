@@ -259,7 +259,7 @@ LAYERS = [  # what PyTorch gets wrong stands first
     (lambda: nn.MaxPool2d(2), IMAGE),
     (lambda: nn.AvgPool1d(2), SEQUENCE),
     (lambda: nn.AdaptiveMaxPool2d(2), IMAGE),
-    (lambda: nn.LPPool1d(3, 2), SEQUENCE),
+    (lambda: nn.LPPool1d(2, 2), SEQUENCE),
     (lambda: nn.Upsample(scale_factor=2, mode="bicubic"), IMAGE),
 ]
 # fmt: on
