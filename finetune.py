@@ -433,10 +433,10 @@ def adapt_tasks(
         kept = len(load_demonstrations(paths[task]).take(settings.demonstrations))
         for column, policy in columns.items():
             successes = evaluate.evaluate_checkpoint(
-                policy,
-                simulator,
-                {task: paths[task]},
-                {task: text[task]},
+                checkpoint=policy,
+                simulator=simulator,
+                recordings={task: paths[task]},
+                text={task: text[task]},
                 episodes=settings.episodes,
                 seed=settings.seed,
                 workers=workers,

@@ -477,10 +477,10 @@ class Evaluation:
         try:
             with stop.suspended():
                 successes = evaluate.evaluate_checkpoint(
-                    self.folder / f"ema-{step:05d}.pt",
-                    self.simulator,
-                    self.recordings,
-                    self.text,
+                    checkpoint=self.folder / f"ema-{step:05d}.pt",
+                    simulator=self.simulator,
+                    recordings=self.recordings,
+                    text=self.text,
                     episodes=settings.episodes,
                     seed=evaluate.EVALUATION_SEED,
                     workers=self.workers,
