@@ -86,7 +86,8 @@ class FlowPolicy(DP3Policy):
     observations on.
     """
 
-    requires: ClassVar = {"sampler": "ddim"}  # it has a sampler of its own, so there is no choice
+    # Its sampler is its own, so there is no choice.
+    requires: ClassVar = {**DP3Policy.requires, "sampler": "ddim"}
 
     START = 0.01  # of t
     STEP = 0.01  # from t to r
@@ -303,7 +304,7 @@ class MambaPolicy(DP3Policy):
     build it and do not run it. Here it runs. Widths, kernel and horizon are that code's.
     """
 
-    requires: ClassVar = {"denoiser": "mamba-unet"}
+    requires: ClassVar = {**DP3Policy.requires, "denoiser": "mamba-unet"}
 
     DROP = 0.2  # the share of windows that a branch is left out for
 
@@ -507,7 +508,11 @@ class FreqPolicy(DP3Policy):
     DDIM steps (`small`: five) whose clean action is clipped (there: ten random ones, unclipped).
     """
 
-    requires: ClassVar = {"denoiser": "frequency-transformer", "sampler": "ddim"}
+    requires: ClassVar = {
+        **DP3Policy.requires,
+        "denoiser": "frequency-transformer",
+        "sampler": "ddim",
+    }
     conditioned_by_h = False  # its network embeds timesteps and observations itself
 
     ROUNDS = 4
@@ -629,8 +634,8 @@ denoisers["frequency-transformer"] = FrequencyTransformer
 demo_encoders["mlp"] = DemonstrationMLP
 
 
-def changed(preset: str, **changes: Any) -> PolicyConfig:
-    """DAMI's preset of a name with `changes`, and without a task."""
+def without_task(preset: str, **changes: Any) -> PolicyConfig:
+    """DAMI's preset of a name with `changes`, for a policy that reads no task."""
     return replace(model.PRESETS[preset], demo_encoder="none", tcfm="none", **changes)
 
 
@@ -640,41 +645,41 @@ def changed(preset: str, **changes: Any) -> PolicyConfig:
 PRESETS = {
     "dami": model.PRESETS,
     "dp3": {
-        "paper": changed("paper", policy="dp3"),
-        "small": changed("small", policy="dp3", unet_widths=(48, 96, 192)),
-        "tiny": changed("tiny", policy="dp3"),
+        "paper": without_task("paper", policy="dp3"),
+        "small": without_task("small", policy="dp3", unet_widths=(48, 96, 192)),
+        "tiny": without_task("tiny", policy="dp3"),
     },
     "flow": {
-        "paper": changed("paper", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
-        "small": changed(
+        "paper": without_task("paper", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
+        "small": without_task(
             "small", policy="flow", sampler="ddim", horizon=4, n_action_steps=3,
             unet_widths=(48, 96, 192),
         ),
-        "tiny": changed("tiny", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
+        "tiny": without_task("tiny", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
     },
     "mamba": {
-        "paper": changed(
+        "paper": without_task(
             "paper", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3,
             unet_widths=(128, 256, 512),
         ),
-        "small": changed(
+        "small": without_task(
             "small", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3,
             unet_widths=(32, 64, 112),
         ),
-        "tiny": changed(
+        "tiny": without_task(
             "tiny", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3
         ),
     },
     "freq": {
-        "paper": changed(
+        "paper": without_task(
             "paper", policy="freq", denoiser="frequency-transformer", sampler="ddim",
             unet_widths=(512, 1024),
         ),
-        "small": changed(
+        "small": without_task(
             "small", policy="freq", denoiser="frequency-transformer", sampler="ddim",
             unet_widths=(128, 256),
         ),
-        "tiny": changed(
+        "tiny": without_task(
             "tiny", policy="freq", denoiser="frequency-transformer", sampler="ddim",
             unet_widths=(32, 64),
         ),
