@@ -626,8 +626,8 @@ def choose_architecture(args: argparse.Namespace, preset: str) -> PolicyConfig:
     config = baselines.PRESETS[args.policy or "dami"][preset]
     try:
         config = replace(config, **{name: x for name, x in flags.items() if x is not None})
-        build_empty(config)
-    except ConfigError as error:
+        model.POLICIES[config.policy].check_config(config)
+    except ValueError as error:
         raise UserError(str(error)) from error
     return config
 

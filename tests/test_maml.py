@@ -293,7 +293,7 @@ def test_a_layer_of_torch_has_the_same_meta_gradient_with_and_without_vmap(make,
 
 @pytest.mark.parametrize("options", [{"padding_idx": 0}, {"scale_grad_by_freq": True}])
 def test_an_embedding_that_vmap_gets_wrong_is_refused(options):
-    with pytest.raises(NotImplementedError, match=r"derivatives of embedding.*use vectorize=1"):
+    with pytest.raises(NotImplementedError, match=r"embedding, .* use vectorize=1"):
         both_ways(Tokens(nn.Embedding(10, 8, **options)), SEQUENCE)
 
 
@@ -302,7 +302,7 @@ def test_a_function_beneath_the_layers_is_refused_as_well():
         def forward(self, x):
             return torch.layer_norm(x, (8,), x[0, 0])
 
-    with pytest.raises(NotImplementedError, match="derivatives of layer_norm"):
+    with pytest.raises(NotImplementedError, match=r"layer_norm, .* use vectorize=1"):
         both_ways(Direct(), SEQUENCE)
 
 
