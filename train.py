@@ -60,15 +60,7 @@ from data import (
     write_text,
 )
 from maml import meta_gradient
-from model import (
-    TASK_INPUTS,
-    CheckpointError,
-    ConfigError,
-    DAMIPolicy,
-    PolicyConfig,
-    ema_model,
-    split,
-)
+from model import TASK_INPUTS, CheckpointError, DAMIPolicy, PolicyConfig, ema_model, split
 from report import Successes
 from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
 
