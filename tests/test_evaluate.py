@@ -540,6 +540,51 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordi
     assert provenance["n_action_steps"] == 4 and "sampler" not in provenance
 
 
+def test_what_the_command_line_says_reaches_the_rollouts(run, recordings, trained, monkeypatch):
+    calls = []
+
+    def measured(checkpoint, recordings, text, **options):
+        calls.append((checkpoint, list(recordings), text, options))
+        return {task: [True] for task in recordings}
+
+    monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
+    flags = "--task touch-green --known-goals --seed 3 --episodes 4 --workers 2 --sampler ddim"
+    evaluate.main(command(run, recordings, flags))
+    [(checkpoint, tasks, text, options)] = calls
+    assert checkpoint == run / "ema-00006.pt" and tasks == ["touch-green"]
+    assert torch.equal(text["touch-green"], features(tasks, None, None)[0][0])
+    assert isinstance(options.pop("simulator"), ToySimulator)
+    assert options == {
+        "episodes": 4,
+        "seed": 3,
+        "workers": 2,
+        "device": torch.device("cpu"),
+        "n_demonstrations": 2,
+        "zero_demonstration": False,
+        "known_goals": True,
+        "config_overrides": {"sampler": "ddim"},
+    }
+    provenance = report_of("runs/evaluation")["provenance"]
+    assert provenance["goals"] == "of the demonstrations, each once"
+    assert provenance["sampler"] == "ddim" and provenance["title"] == "touch-green"
+
+
+def test_a_policy_that_was_adapted_without_its_instruction_is_not_given_one(
+    trained, recordings, monkeypatch
+):
+    texts = []
+
+    def measured(checkpoint, recordings, text, **_):
+        texts.extend(text.values())
+        return {task: [True] for task in recordings}
+
+    monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
+    info = {**INFO, "adapted_to": "touch-blue", "adaptation": {"instruction": False}}
+    model.save("adapted.pt", trained, **info)
+    evaluate.main(command("adapted.pt", recordings))
+    assert len(texts) == 1 and not texts[0].any()
+
+
 def test_a_run_of_another_policy_stands_beside_that_policys_published_numbers(
     run, recordings, monkeypatch, capsys
 ):
