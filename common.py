@@ -70,10 +70,12 @@ def add_settings(parser: Any, settings_class: type, presets: dict[str, Any] | No
 
     Args:
         parser: a parser of argparse, or a group of one.
-        settings_class: its fields are made by `setting`.
+        settings_class: its fields are made by `setting`; others get no flag.
         presets: name -> settings; the help of a flag then tells the value in each preset.
     """
     for f in fields(settings_class):
+        if "help" not in f.metadata:
+            continue
         values = {name: getattr(preset, f.name) for name, preset in (presets or {}).items()}
         help = f.metadata["help"] + describe_presets(values)
         kind = next((t for t in get_args(f.type) if t is not type(None)), f.type)  # int | None
@@ -95,7 +97,7 @@ def describe_presets(values: dict[str, Any]) -> str:
 
 def with_flags(settings: Any, args: argparse.Namespace) -> Any:
     """Returns the settings with what was given on the command line in place of their own values."""
-    given = {f.name: getattr(args, f.name) for f in fields(settings)}
+    given = {f.name: getattr(args, f.name) for f in fields(settings) if "help" in f.metadata}
     return replace(settings, **{name: x for name, x in given.items() if x is not None})
 
 

@@ -28,6 +28,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from common import UserError, command_line, progress_bar
 from data import (
     Demonstrations,
     RecordingError,
@@ -35,8 +36,8 @@ from data import (
     load_demonstrations,
     save_demonstrations,
 )
+from report import plot_demonstration
 from robot import CameraError, cloud, no_pose, unfit
-from scripts import at_least, command_line, draw_demonstration, progress_bar
 
 # What the JSON of --camera may hold. Without a pose points stay in the frame of the camera: right,
 # down, forward. The positions in a state must be in the frame of the points.
@@ -244,7 +245,8 @@ def read_json(path: Path) -> dict[str, Any]:
 def import_recordings(args: argparse.Namespace) -> list[Path]:
     """Writes a file for each task that was found; returns their paths."""
     path = Path(args.import_)
-    at_least(1, **{"num-points": args.num_points})
+    if args.num_points < 1:
+        raise UserError(f"--num-points is {args.num_points}: use at least 1")
     if not path.exists():
         refuse(path, "is missing: look at --import")
     if (path / "meta" / "info.json").is_file():
@@ -308,9 +310,9 @@ def main(argv: list[str] | None = None) -> None:
     recorded = load_demonstrations(args.show)
     if not 0 <= args.episode < len(recorded):
         refuse(args.show, f"holds episodes 0 to {len(recorded) - 1}, not {args.episode}")
-    draw_demonstration(recorded, out, args.episode)
+    plot_demonstration(recorded, out, args.episode)
     print(f"wrote {out}")
 
 
 if __name__ == "__main__":
-    command_line(main)
+    command_line(main, errors=(RecordingError,))

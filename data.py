@@ -36,9 +36,10 @@ class RecordingError(ValueError):
 
 
 def positions(points: Any) -> Any:
-    """Returns the positions (..., 3), metres, of points (..., 3 or more), an array or a tensor.
+    """Returns the positions (..., 3) of points (..., P), an array or a tensor.
 
-    What stands behind the positions are features of the points, such as colours.
+    The first three numbers of a point are its position in metres. Any others are its features, such
+    as a colour from 0 to 1. Features do not count for distances, and nothing moves or scales them.
     """
     return points[..., :3]
 
@@ -72,10 +73,12 @@ FLOATS = (np.float16, np.float32, np.float64)  # in this machine's byte order
 class Demonstrations:
     """Recorded episodes of one task, one after the other.
 
-    `meta` says how they were made, in what JSON can hold. Four of its entries have a meaning here:
+    `meta` says how they were made, in values that JSON can hold. Four entries have a meaning here;
+    each may be left out:
 
-    - positions_in_state: how many points of space, x y z each, a state begins with, where an action
-      begins with a change of the first. Scenes can be augmented only where this is known.
+    - positions_in_state: k, where the first 3 k numbers of a state are k positions x, y, z in the
+      frame of the points, and the first three of an action are a change of the first position.
+      Only such scenes can be augmented.
     - success_frames: the frame of each episode's first success, counted from the episode's start.
     - workspace: two opposite corners of the box that holds the points, metres.
     - simulator: the name of the simulator that they were made in; own recordings have none.
@@ -83,7 +86,7 @@ class Demonstrations:
 
     task: str
     instruction: str
-    points: np.ndarray  # (F, N, P) float16 in the order of farthest point sampling; metres first
+    points: np.ndarray  # (F, N, P) float16, in the order of farthest point sampling
     state: np.ndarray  # (F, S) float32
     action: np.ndarray  # (F, A) float32
     episode_ends: np.ndarray  # (E,) int64: one past the last frame of each episode
@@ -302,7 +305,7 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
 
 def write_text(path: str | Path, text: str) -> None:
     """Writes a text file, whole or not at all."""
-    write_atomically(path, lambda temporary: temporary.write_text(text))
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def save_demonstrations(path: str | Path, demonstrations: Demonstrations) -> None:
@@ -473,11 +476,12 @@ class WindowSampler:
         self.state = torch.tensor(demonstrations.state, dtype=torch.float32, device=device)
         self.action = torch.tensor(demonstrations.action, dtype=torch.float32, device=device)
 
-        # What augmentation has to know
+        # For augmentation
         self.positions_in_state = demonstrations.meta.get("positions_in_state", 0)
         self.augment = augment and self.positions_in_state > 0
         self.center = workspace_center(points, demonstrations.meta.get("workspace"))  # (1, 3)
-        self.max_displacement = max(1.0, float(self.action[:, :3].abs().max()))  # as recorded
+        largest = float(self.action[:, :3].abs().max())
+        self.max_displacement = max(1.0, largest)  # moved actions are clipped to it
 
         success_frames = demonstrations.meta.get("success_frames")
         windows = []  # of each episode

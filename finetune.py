@@ -6,50 +6,77 @@
 
 The EMA policy of meta-training is trained on with AdamW, each step on windows of the task's
 demonstrations and one of them as reference; its three parts have learning rates of their own, and
-there is neither warm-up nor decay. What is kept is an EMA again. On a Meta-World task the policy is
-rolled out before and after: the difference is what adaptation bought.
+there is neither warm-up nor decay. What is kept is an EMA again. A task of a simulator is rolled
+out before and after: the difference is what adaptation bought.
 """
 
 import argparse
 import copy
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+import common
 import evaluate
-import scripts
-from data import WindowSampler, load_demonstrations
-from model import DAMIPolicy, ema_model
-from report import write_report
-from scripts import Flags, command_line, load_checkpoint, progress_bar, save_checkpoint, setting
-from simulator import check_task, collect, is_simulated, suite_tasks
+import model
+import report
+from clip import TextWeightsError
+from common import CUDAGraphed, UserError, append_json, setting
+from data import (
+    Demonstrations,
+    RecordingError,
+    WindowSampler,
+    hold_out,
+    load_demonstrations,
+    write_text,
+)
+from model import CheckpointError, DAMIPolicy, ema_model
+from report import Successes
+from simulator import (
+    SIMULATORS,
+    Simulator,
+    check_recipe,
+    check_task,
+    collect,
+    made_by_simulator,
+    simulator_of,
+)
 
 LEARNING_RATES = {"vision": 1e-5, "diffusion": 3e-5, "other": 1e-4}  # AdamW's, by part
 PAPER_LEARNING_RATE = 1e-4  # of the meta-training that they belong to
-BATCH = {"paper": 108, "small": 64, "tiny": 16}  # windows a step
+BATCH = {"paper": 108, "small": 64, "tiny": 16}  # windows a step, by preset
+COLLECTED = 10  # demonstrations of a simulator's task; of a file all are used
 
 
 @dataclass(frozen=True)
-class Settings(Flags):
+class Settings:
     """What an adaptation is made of; each field is a flag. None: as the preset has it."""
 
     steps: int = setting(200, "gradient steps (default: 200)", least=1)
-    batch: int | None = setting(None, f"windows a step{scripts.of_presets(BATCH)}", least=1)
+    batch: int | None = setting(None, f"windows a step{common.describe_presets(BATCH)}", least=1)
     lr_vision: float | None = setting(None, "learning rate of the observation encoder", least=0)
-    lr_diffusion: float | None = setting(None, "learning rate of the U-Net", least=0)
+    lr_diffusion: float | None = setting(None, "learning rate of the denoiser", least=0)
     lr_other: float | None = setting(None, "learning rate of VMT and U2T", least=0)
     instruction: bool = setting(True, "--no-instruction: adapt and roll out without it")
-    normalizer: str = setting("fit", "to the task, or `keep` the suite's", choices=("fit", "keep"))
+    normalizer: str = setting(
+        "fit", "fit it to the task's data, or keep that of training", choices=("fit", "keep")
+    )
     demonstrations: int | None = setting(None, "how many (default: 10; of a file all)", least=1)
-    held_out: int = setting(0, "of them, the last so many only judge (default: 0)", least=0)
+    held_out: int = setting(
+        0, "of them, the last so many are only for measuring (default: 0)", least=0
+    )
     episodes: int = setting(20, "rollouts before and after (default: 20)", least=0)
     seed: int = setting(0, "of batches, noise and goals (default: 0)", least=0, most=999)
+
+    def __post_init__(self) -> None:
+        common.check_settings(self)
 
 
 # ---- Algorithm 2 ---------------------------------------------------------------------------------
@@ -59,6 +86,7 @@ def adapt_policy(
     policy: DAMIPolicy,
     sampler: WindowSampler,
     text: Tensor,
+    *,
     steps: int,
     batch: int,
     learning_rates: dict[str, float],
@@ -74,199 +102,438 @@ def adapt_policy(
         learning_rates: of the parameter groups `vision`, `diffusion` and `other`.
         seed: of batches, demonstrations and noise.
 
-    Yields (steps done, loss, the moving average of the adapted policy) after each step. Raises
-    ValueError if the loss is not finite.
+    Yields:
+        (steps done, loss, the moving average of the adapted policy) after each step. The average is
+        always the same object.
+
+    Raises:
+        UserError: the loss is not finite.
     """
     adapted = copy.deepcopy(policy).train()  # line 2
     average = ema_model(adapted)
     average.module.eval()
-    parts = adapted.parameter_groups().items()
-    groups = [{"params": part, "lr": learning_rates[name]} for name, part in parts if part]
-    optimizer = torch.optim.AdamW(groups, betas=(0.95, 0.999), weight_decay=1e-6, fused=True)
+    optimizer = torch.optim.AdamW(
+        [
+            {"params": parameters, "lr": learning_rates[part]}
+            for part, parameters in adapted.parameter_groups().items()
+            if parameters
+        ],
+        betas=(0.95, 0.999),
+        weight_decay=1e-6,
+        fused=True,
+    )
     generator = torch.Generator().manual_seed(seed)
 
-    def loss_and_gradient(drawn: dict[str, Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
-        loss = adapted.loss(text=text[None], **drawn)  # lines 8 to 14
-        return loss.detach(), torch.autograd.grad(loss, list(adapted.parameters()))
-
+    gradient_of = partial(loss_and_gradients, adapted)
     lengths = {episode.stop - episode.start for episode in sampler.episodes}
-    if text.is_cuda and len(lengths) == 1:  # always equal shapes
-        loss_and_gradient = scripts.Captured(loss_and_gradient)
+    if text.is_cuda and len(lengths) == 1:  # the shapes are the same in every step
+        gradient_of = CUDAGraphed(gradient_of)
 
     for step in range(1, steps + 1):  # line 6
-        drawn = sampler.batch(batch, generator)  # line 7
-        drawn |= adapted.draw_noise_and_timesteps(batch, generator)  # line 10
+        drawn = {
+            "text": text[None],
+            **sampler.batch(batch, generator),  # line 7
+            **adapted.draw_noise_and_timesteps(batch, generator),  # line 10
+        }
         drawn = {name: x.to(text.device) for name, x in drawn.items()}
-        loss, gradient = loss_and_gradient(drawn)
+        loss, gradients = gradient_of(drawn)  # lines 8 to 14
         if not torch.isfinite(loss):
-            raise ValueError(f"{sampler.task}: loss not finite at step {step}, lower the --lr-...")
+            raise UserError(
+                f"{sampler.task}: the loss is not finite at step {step}: use smaller learning "
+                "rates, --lr-vision, --lr-diffusion and --lr-other"
+            )
 
-        for parameter, g in zip(adapted.parameters(), gradient):
-            parameter.grad = g
+        for parameter, gradient in zip(adapted.parameters(), gradients):
+            parameter.grad = gradient
         torch.nn.utils.clip_grad_norm_(adapted.parameters(), 1.0)
         optimizer.step()  # line 15
         average.update_parameters(adapted)  # line 16
         yield step, loss.item(), average.module
 
 
+def loss_and_gradients(
+    policy: DAMIPolicy, batch: dict[str, Tensor]
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """The loss () of a batch, and its gradient for each parameter."""
+    loss = policy.loss(**batch)
+    return loss.detach(), torch.autograd.grad(loss, list(policy.parameters()))
+
+
 # ---- From files to files -------------------------------------------------------------------------
+
+
+def resolve(settings: Settings, info: dict[str, Any]) -> Settings:
+    """The settings with numbers where they leave it to the training, which `info` tells.
+
+    `info` is what a checkpoint says beside its weights. The paper's learning rates belong to a
+    meta-training at 1e-4; to one at another rate they keep their proportion.
+    """
+    scale = info["arguments"]["lr"] / PAPER_LEARNING_RATE
+    numbers = {"batch": BATCH[info["preset"]]}
+    for part, rate in LEARNING_RATES.items():
+        numbers[f"lr_{part}"] = rate * scale
+    left_open = {name: x for name, x in numbers.items() if getattr(settings, name) is None}
+    return replace(settings, **left_open)
+
+
+def log_heldout_error(
+    folder: Path,
+    step: int,
+    policy: DAMIPolicy,
+    train_sampler: WindowSampler,
+    heldout_sampler: WindowSampler,
+    text: Tensor,
+) -> tuple[float, float]:
+    """Logs the action error on held-out episodes; returns it, and that of the mean action."""
+    error, of_mean_action = evaluate.action_error(policy, train_sampler, heldout_sampler, text)
+    append_json(
+        folder / "metrics.jsonl",
+        step=step,
+        action_error=error,
+        action_errors={train_sampler.task: error},
+    )
+    return error, of_mean_action
+
+
+def checkpoint_after(folder: Path, step: int) -> Path:
+    """The checkpoint of an adaptation that goes on after this step."""
+    return folder / f"adapted-{step:05d}.pt"
 
 
 def adapt_checkpoint(
     checkpoint: Path,
-    data: Path,
+    recording: Path,
     text: Tensor,
     folder: Path,
     settings: Settings,
+    *,
     curve: Sequence[int] = (),
-    **changed: Any,
-) -> dict[str, Any]:
+    config_overrides: dict[str, Any] | None = None,
+) -> float:
     """Adapts the policy of a checkpoint to the task of a recording, on the device of `text`.
 
-    Writes adapted.pt (a checkpoint like any other; after the steps in `curve` adapted-STEP.pt),
-    metrics.jsonl and config.json to `folder`; returns what config.json says, `seconds` among it.
-    What is in `changed` takes the place of the same in the policy's configuration. Raises
-    ValueError where the two files do not fit each other.
+    Writes adapted.pt, a checkpoint like any other, metrics.jsonl and config.json to `folder`, and
+    held-out.md if there are held-out episodes.
+
+    Args:
+        checkpoint: a file of train.py or finetune.py.
+        recording: a file with the task's demonstrations.
+        text: instruction feature, (text_dim,).
+        folder: it exists.
+        settings: how to adapt.
+        curve: after so many steps each, adapted-STEP.pt is written as well.
+        config_overrides: of the policy's configuration, see `evaluate.inference_overrides`.
+
+    Returns:
+        The seconds that the gradient steps took.
+
+    Raises:
+        RecordingError, CheckpointError: one of the two files is damaged, or they do not fit.
+        UserError: the loss is not finite.
     """
-    policy, info = load_checkpoint(checkpoint, text.device, evaluate.TRAINED, **changed)
-    demonstrations = load_demonstrations(data).take(settings.demonstrations)
-    trained, task = info["arguments"], demonstrations.task
-    how = policy.config, "cpu", trained.get("after_success")
-    parts = evaluate.hold_out({task: demonstrations}, settings.held_out)
-    shown, unseen = (scripts.windows(part, *how) for part in parts)
-    sampler, judged_by = shown[task], (shown, unseen, {task: text})
-    scripts.rewind_metrics(folder, 0)
-    evaluate.judge(folder, 0, policy, *judged_by)
+    policy, info = evaluate.load_trained(checkpoint, text.device, **(config_overrides or {}))
+    settings = resolve(settings, info)
+    demonstrations = load_demonstrations(recording).take(settings.demonstrations)
+    kept, heldout = hold_out(demonstrations, settings.held_out)
+    after_success = info["arguments"]["after_success"]
+    sampler = WindowSampler(kept, policy.config, after_success=after_success)
+    write_text(folder / "metrics.jsonl", "")
+    if heldout is not None:
+        heldout_sampler = WindowSampler(heldout, policy.config)
+        before, _ = log_heldout_error(folder, 0, policy, sampler, heldout_sampler, text)
     if settings.normalizer == "fit":
         policy.normalizer.fit([sampler])  # line 3
 
-    # The paper's rates belong to a meta-training at 1e-4; for another they keep their proportion.
-    scale = trained["lr"] / PAPER_LEARNING_RATE
-    given = {part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES}
-    rates = {p: lr * scale if given[p] is None else given[p] for p, lr in LEARNING_RATES.items()}
-    batch = settings.batch or BATCH[info["preset"]]
-    used = asdict(settings) | {"batch": batch, "learning_rates": rates}
-    resolved = used | {f"lr_{part}": rate for part, rate in rates.items()}
-    scripts.print_settings(resolved, asdict(Settings()))
-    about = {name: info[name] for name in evaluate.TRAINED} | {"adaptation": used}
-    about |= {"adapted_to": task, "instruction": demonstrations.instruction}
-
+    checkpoint_info = {
+        **{name: info[name] for name in evaluate.TRAINED},
+        "adaptation": asdict(settings),
+        "adapted_to": demonstrations.task,
+        "instruction": demonstrations.instruction,
+    }
+    training = adapt_policy(
+        policy,
+        sampler,
+        text,
+        steps=settings.steps,
+        batch=settings.batch,
+        learning_rates={part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES},
+        seed=settings.seed,
+    )
     seconds, began = 0.0, time.monotonic()
-    bar = {"desc": f"adapting to {task}", "unit": "step"}
-    training = adapt_policy(policy, sampler, text, settings.steps, batch, rates, settings.seed)
-    with progress_bar(total=settings.steps, **bar) as progress:
+    with common.progress_bar(
+        desc=f"adapting to {demonstrations.task}", unit="step", total=settings.steps
+    ) as bar:
         for step, loss, adapted in training:
             seconds += time.monotonic() - began
-            progress.set_postfix(loss=f"{loss:.4f}")
-            progress.update()
-            scripts.log(folder, step=step, loss=loss)
+            bar.set_postfix(loss=f"{loss:.4f}")
+            bar.update()
+            append_json(folder / "metrics.jsonl", step=step, loss=loss)
             if step in curve:
-                save_checkpoint(folder / f"adapted-{step:05d}.pt", adapted, **about)
+                model.save(checkpoint_after(folder, step), adapted, **checkpoint_info)
             began = time.monotonic()
+    model.save(folder / "adapted.pt", adapted, **checkpoint_info)
 
-    save_checkpoint(folder / "adapted.pt", adapted, **about)
-    table = evaluate.judge(folder, settings.steps, adapted, *judged_by)
-    print(table, end="\n" if table else "", flush=True)
-    written = {"checkpoint": str(checkpoint), "data": str(data), **used, "seconds": seconds}
-    scripts.write_text(folder / "config.json", json.dumps(written, indent=1))
-    return written
+    if heldout is not None:
+        after, of_mean_action = log_heldout_error(
+            folder, settings.steps, adapted, sampler, heldout_sampler, text
+        )
+        columns = {"step 0": before, f"step {settings.steps}": after}
+        columns["the mean action"] = of_mean_action
+        table = report.heldout_table(
+            {title: {demonstrations.task: error} for title, error in columns.items()}
+        )
+        print(table, flush=True)
+        write_text(
+            folder / "held-out.md", f"{table}\n\nMean absolute error, in the action's unit.\n"
+        )
+    written = {
+        "checkpoint": str(checkpoint),
+        "data": str(recording),
+        **asdict(settings),
+        "seconds": seconds,
+    }
+    write_text(folder / "config.json", json.dumps(written, indent=1))
+    return seconds
+
+
+def read_instructions(paths: dict[str, Path], settings: Settings) -> dict[str, str]:
+    """Task -> instruction, of recordings (task -> file).
+
+    Raises RecordingError for a recording of fewer demonstrations than the settings ask for.
+    """
+    instructions = {}
+    for task, path in paths.items():
+        demonstrations = load_demonstrations(path).take(settings.demonstrations)
+        hold_out(demonstrations, settings.held_out)
+        instructions[task] = demonstrations.instruction
+    return instructions
 
 
 # ---- Command line --------------------------------------------------------------------------------
 
 
-def parse(argv: list[str] | None) -> argparse.Namespace:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Adapts a policy to one task (Algorithm 2).")
-    add = parser.add_argument_group("run").add_argument
-    add("--task", nargs="+", help="tasks of Meta-World, or `novel`: the novel ones of the suite")
-    add("--suite", help="of the run to start from, and of `novel` (default: the run's, or ml10)")
+    group = parser.add_argument_group("run")
+    add = group.add_argument
+    add("--task", nargs="+", help="tasks of the suite's simulator, or `novel`: the suite's own")
+    add("--suite", help="of the run to start from, and of the tasks (default: the run's, or ml10)")
     add("--data", default="data", help="folder of the demonstrations, or one file (default: data)")
     add("--checkpoint", help="file or run folder to start from (default: the newest run's last)")
     add("--curve", nargs="+", type=int, default=[], help="roll out after these steps, too")
     add("--out", help="folder of the adapted policy (default: runs/finetune/TASK-seedSEED)")
     add("--overwrite", action="store_true", help="replace what is in that folder")
-    scripts.add_inference_flags(add)
-    scripts.add_common_flags(add)
-    rates = f"Learning rates at a meta-training rate of {PAPER_LEARNING_RATE:g}: {LEARNING_RATES}."
-    Settings.add_flags(parser.add_argument_group("settings", rates))
+    evaluate.add_inference_flags(group)
+    common.add_common_flags(group)
+    rates = ", ".join(f"{part} {rate:g}" for part, rate in LEARNING_RATES.items())
+    group = parser.add_argument_group(
+        "settings", f"Learning rates at a meta-training rate of {PAPER_LEARNING_RATE:g}: {rates}."
+    )
+    common.add_settings(group, Settings)
     return parser.parse_args(argv)
 
 
-def main(argv: list[str] | None = None) -> None:
-    args = parse(argv)
-    settings = Settings().given(args)
-    device = scripts.pick_device(args.device, args.threads)
-
-    # Which tasks, and from which policy
-    file = Path(args.data) if args.data.endswith(".npz") else None
-    if args.task is None and file is None:
-        raise ValueError("name a task of Meta-World with --task, or a recording with --data")
-    simulated = True
-    if file is not None:
-        recorded = load_demonstrations(file)
-        tasks, simulated = [recorded.task], is_simulated(recorded, file)
-        if args.task not in (None, tasks):
-            raise ValueError(f"{file} is a recording of {tasks[0]}, not of {args.task[0]}")
-    elif args.task != ["novel"]:
-        tasks = [check_task(task) for task in args.task]
-    suite_tasks(args.suite or "ml10")  # refuses a wrong one now
+def check_flags(args: argparse.Namespace, settings: Settings) -> None:
+    """Raises UserError for what can be refused before any file is read."""
+    if args.task is None and not args.data.endswith(".npz"):
+        raise UserError("name a task of a simulator with --task, or a recording with --data")
+    if args.suite is not None:
+        common.choose(args.suite, SIMULATORS, "suite")
     if not all(0 < step < settings.steps for step in args.curve):
-        raise ValueError(f"--curve: use steps from 1 to {settings.steps - 1}, those before --steps")
-    suite = args.suite or "ml10" if simulated else "own"
-    checkpoint = scripts.checkpoints_of(args.checkpoint or evaluate.default_checkpoint(suite))[-1]
-    changed = scripts.inference(args)
-    _, info = load_checkpoint(checkpoint, needs=evaluate.TRAINED, **changed)
-    if args.task == ["novel"]:
-        tasks = suite_tasks(args.suite or info["suite"])[1]
-    where = f"{device} ({scripts.hardware(device)})"
+        raise UserError(f"--curve: use steps from 1 to {settings.steps - 1}, those before --steps")
+
+
+def choose_checkpoint(args: argparse.Namespace, simulated: bool) -> Path:
+    """The policy to start from: --checkpoint, or that of the newest run on the suite."""
+    if args.checkpoint is not None:
+        return evaluate.checkpoints_of(args.checkpoint)[-1]
+    return evaluate.default_checkpoint((args.suite or "ml10") if simulated else "own")
+
+
+def choose_tasks(names: Sequence[str], simulator: Simulator, suite: str) -> list[str]:
+    """The tasks of a simulator that --task names."""
+    if list(names) == ["novel"]:
+        _, novel = simulator.tasks(suite)
+        return novel
+    return [check_task(simulator, name) for name in names]
+
+
+def check_recording(
+    recording: Demonstrations, file: Path, names: Sequence[str] | None, simulator: Simulator | None
+) -> None:
+    """Raises UserError for a recording of another task than --task says (`names`).
+
+    Of a simulator's recording it also checks that the simulator makes such ones today.
+    """
+    if names is not None and list(names) != [recording.task]:
+        raise UserError(f"{file} is a recording of {recording.task}, not of {' '.join(names)}")
+    if simulator is not None:
+        check_task(simulator, recording.task)
+        check_recipe(recording, file, simulator.recipe)
+
+
+def claim_folders(folders: Iterable[Path], checkpoint: Path, overwrite: bool) -> list[Path]:
+    """The old results in the folders, which are to be removed, see `evaluate.claim_results`.
+
+    Raises UserError if `checkpoint` is one of them.
+    """
+    old_files = []
+    for folder in folders:
+        old_files += evaluate.claim_results(folder, overwrite)
+    if checkpoint.resolve() in [file.resolve() for file in old_files]:
+        raise UserError(f"{checkpoint} itself would be overwritten: choose another --out")
+    return old_files
+
+
+def adapt_tasks(
+    checkpoint: Path,
+    paths: dict[str, Path],
+    text: dict[str, Tensor],
+    folders: dict[str, Path],
+    settings: Settings,
+    *,
+    curve: Sequence[int],
+    config_overrides: dict[str, Any],
+    simulator: Simulator | None,
+    workers: int | None,
+) -> tuple[dict[str, Successes], float]:
+    """Adapts a policy to each task by itself, and rolls it out before, in between and after.
+
+    Args:
+        checkpoint: the policy.
+        paths, text, folders: task -> its recording, instruction feature and folder to write to.
+        settings, curve, config_overrides: see `adapt_checkpoint`.
+        simulator: to roll out in; None: there is none.
+        workers: processes for the rollouts; None: one a core.
+
+    Returns:
+        Column ("before", "50 steps" ..., "after") -> task -> success of each episode, no columns
+        without rollouts; and the seconds that adapting took, for all tasks together.
+    """
+    results: dict[str, Successes] = {}
+    total_seconds = 0.0
+    for task, folder in folders.items():
+        seconds = adapt_checkpoint(
+            checkpoint,
+            paths[task],
+            text[task],
+            folder,
+            settings,
+            curve=curve,
+            config_overrides=config_overrides,
+        )
+        total_seconds += seconds
+        print(f"adapted to {task} in {seconds:.1f} s; wrote {folder / 'adapted.pt'}", flush=True)
+        if simulator is None or settings.episodes == 0:
+            continue
+
+        columns = {"before": checkpoint}
+        columns |= {f"{step} steps": checkpoint_after(folder, step) for step in sorted(set(curve))}
+        columns["after"] = folder / "adapted.pt"
+        kept = len(load_demonstrations(paths[task]).take(settings.demonstrations))
+        for column, policy in columns.items():
+            successes = evaluate.evaluate_checkpoint(
+                checkpoint=policy,
+                simulator=simulator,
+                recordings={task: paths[task]},
+                text={task: text[task]},
+                episodes=settings.episodes,
+                seed=settings.seed,
+                workers=workers,
+                device=text[task].device,
+                n_demonstrations=kept - settings.held_out,
+                config_overrides=config_overrides,
+            )
+            results.setdefault(column, {}).update(successes)
+    return results, total_seconds
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(argv)
+    settings = common.with_flags(Settings(), args)
+    check_flags(args, settings)
+    device = common.pick_device(args.device, args.threads)
+
+    # A recording in a file, one's own or a simulator's; or tasks of a simulator to collect
+    file = Path(args.data) if args.data.endswith(".npz") else None
+    recording = None if file is None else load_demonstrations(file)
+    simulated = recording is None or made_by_simulator(recording)
+    if recording is None and settings.demonstrations is None:
+        settings = replace(settings, demonstrations=COLLECTED)
+
+    # The policy to start from
+    checkpoint = choose_checkpoint(args, simulated)
+    config_overrides = evaluate.inference_overrides(args)
+    policy, info = evaluate.load_trained(checkpoint, **config_overrides)
+    settings = resolve(settings, info)
+    where = f"{device} ({common.hardware(device)})"
     print(f"{checkpoint}: preset {info['preset']}, step {info['step']}, on {where}", flush=True)
 
-    several = args.task is not None and (len(args.task) > 1 or args.task == ["novel"])
+    # The tasks, and the simulator to roll them out in
+    suite = args.suite or info["suite"]
+    if simulated and suite == "own":
+        raise UserError(f"{checkpoint} was trained on own recordings: name the task's --suite")
+    simulator = simulator_of(suite) if simulated else None
+    if recording is None:
+        tasks = choose_tasks(args.task, simulator, suite)
+    else:
+        check_recording(recording, file, args.task, simulator)
+        tasks = [recording.task]
+
+    # Results of one task stand in the folder itself, those of several in a folder each
     name = "-".join(args.task or tasks)
-    folder = Path(args.out or f"runs/finetune/{name}-seed{settings.seed}")
-    folders = {task: folder / task if several else folder for task in tasks}
-    if file is None:
-        settings = replace(settings, demonstrations=settings.demonstrations or 10)
+    out = Path(args.out or f"runs/finetune/{name}-seed{settings.seed}")
+    several = len(tasks) > 1 or args.task == ["novel"]
+    folders = {task: out / task if several else out for task in tasks}
 
-    with scripts.locked(folder):
-        claimed = {folder, *folders.values()}
-        old = [file for path in claimed for file in scripts.claim_folder(path, args.overwrite)]
-        if checkpoint.resolve() in [path.resolve() for path in old]:
-            raise ValueError(f"{checkpoint} itself would be overwritten: choose another --out")
-        n, how = settings.demonstrations, (args.clip_weights, info["text_weights"], device)
-        paths = {tasks[0]: file} if file else collect(tasks, args.data, n, workers=args.workers)
-        recorded = {task: load_demonstrations(paths[task]).take(n) for task in tasks}
-        shown, _ = evaluate.hold_out(recorded, settings.held_out)  # refuses too many now
-        text, identity = scripts.instruction_features(recorded, *how, told=settings.instruction)
-        for file in old:
-            file.unlink()
+    with common.locked(out):
+        old_files = claim_folders({out, *folders.values()}, checkpoint, args.overwrite)
+        if recording is None:
+            n = settings.demonstrations
+            paths = collect(simulator, tasks, args.data, episodes=n, workers=args.workers)
+        else:
+            paths = {recording.task: file}
+        instructions = read_instructions(paths, settings)
+        text, text_weights = evaluate.instruction_features(
+            instructions,
+            weights=args.clip_weights,
+            identity=info["text_weights"],
+            device=device,
+            use_instruction=settings.instruction,
+        )
+        for old_file in old_files:  # nothing more can be refused
+            old_file.unlink()
 
-        # Each task before, in between if asked for, and after
-        between = sorted(set(args.curve))
-        columns = {"before": checkpoint.resolve()}
-        columns |= {f"{step} steps": f"adapted-{step:05d}.pt" for step in between}
-        columns["after"] = "adapted.pt"
-        results, seconds = {column: {} for column in columns}, 0.0
-        for task, out in folders.items():
-            arguments = checkpoint, paths[task], text[task], out, settings, between
-            took = adapt_checkpoint(*arguments, **changed)["seconds"]
-            seconds += took
-            print(f"adapted to {task} in {took:.1f} s; wrote {out / 'adapted.pt'}", flush=True)
-            if simulated and settings.episodes:
-                protocol = (settings.episodes, settings.seed, args.workers, device)
-                for column, policy in columns.items():
-                    of_task = {task: paths[task]}, text, *protocol, len(shown[task])
-                    results[column] |= evaluate.evaluate(out / policy, *of_task, **changed)
-        if not results["after"]:
-            return  # own recordings have no simulator to be rolled out in
-
-        facts = {"title": f"{name}: before and after {settings.steps} steps"}
-        facts |= {"checkpoint": str(checkpoint), "seconds a task": round(seconds / len(tasks), 1)}
-        kept = ("steps", "demonstrations", "episodes", "seed", "instruction")
-        facts |= {"text weights": identity} | {key: getattr(settings, key) for key in kept}
-        facts |= scripts.report_facts("finetune.py", argv, device) | changed
-        print(f"\n{write_report(folder, results, facts, info['suite'])}")
+        common.print_settings(used=asdict(settings), default=asdict(Settings()))
+        results, seconds = adapt_tasks(
+            checkpoint,
+            paths,
+            text,
+            folders,
+            settings,
+            curve=args.curve,
+            config_overrides=config_overrides,
+            simulator=simulator,
+            workers=args.workers,
+        )
+        if not results:
+            return
+        provenance = {
+            "title": f"{name}: before and after {settings.steps} steps",
+            "checkpoint": str(checkpoint),
+            "seconds a task": round(seconds / len(tasks), 1),
+            "text weights": text_weights,
+            "steps": settings.steps,
+            "demonstrations": settings.demonstrations,
+            "episodes": settings.episodes,
+            "seed": settings.seed,
+            "instruction": settings.instruction,
+            **common.provenance("finetune.py", argv, device),
+            **config_overrides,
+        }
+        paper = report.paper_columns(suite, [policy.config.policy])
+        print(f"\n{report.write_report(out, results, provenance, paper=paper)}")
 
 
 if __name__ == "__main__":
-    command_line(main)
+    common.command_line(main, errors=(RecordingError, CheckpointError, TextWeightsError))

@@ -242,10 +242,6 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
     def close(self) -> None:
         self.sawyer_env.close()
 
-    @property
-    def simulator(self) -> gymnasium.Env:  # old name, until its callers are rewritten
-        return self.sawyer_env
-
 
 if "DAMI/MetaWorld-v0" not in gymnasium.registry:
     gymnasium.register("DAMI/MetaWorld-v0", entry_point=f"{__name__}:MetaWorldPointCloudEnv")

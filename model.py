@@ -27,7 +27,7 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -38,6 +38,10 @@ from torch import Generator, Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
 # ---- Configuration -------------------------------------------------------------------------------
+
+
+class ConfigError(ValueError):
+    """A configuration that no policy can have; the message names the fields and their values."""
 
 
 @dataclass(frozen=True)
@@ -85,57 +89,60 @@ class PolicyConfig:
         self.check_relations()
 
     def check_fields(self) -> None:
-        """Raises ValueError for a field whose value no policy can have."""
+        """Raises ConfigError for a field whose value no policy can have."""
         for name, known in choices().items():
             value = getattr(self, name)
             if value not in known:
-                raise ValueError(f"{name} is {value!r}; use one of {', '.join(known)}")
-        for name, value in vars(self).items():
-            if isinstance(value, int) and not 1 <= value <= 100_000:
-                raise ValueError(f"{name} is {value}: use at least 1, at most 100000")
+                raise ConfigError(f"{name} is {value!r}; use one of {', '.join(known)}")
+        for field in fields(self):
+            name, value = field.name, getattr(self, field.name)
+            if field.type in (int, str) and type(value) is not field.type:
+                raise ConfigError(f"{name} is {value!r}: use {field.type.__name__}")
+            if field.type is int and not 1 <= value <= 100_000:
+                raise ConfigError(f"{name} is {value}: use at least 1, at most 100000")
         for name in ("pointnet_widths", "unet_widths"):
             widths = getattr(self, name)
-            if not widths or min(widths) < 1:
-                raise ValueError(f"{name} is {widths}: use one width or more, each at least 1")
+            if not widths or any(type(width) is not int or width < 1 for width in widths):
+                raise ConfigError(f"{name} is {widths}: use one width or more, each at least 1")
         for name in ("vmt_layers", "u2t_layers"):
             if getattr(self, name) > 99:
-                raise ValueError(f"{name} is {getattr(self, name)}: use at most 99")
+                raise ConfigError(f"{name} is {getattr(self, name)}: use at most 99")
         if self.point_dim < 3:
-            raise ValueError(f"point_dim is {self.point_dim}: a position alone has 3 numbers")
+            raise ConfigError(f"point_dim is {self.point_dim}: a position alone has 3 numbers")
         if self.timestep_dim < 4 or self.timestep_dim % 2:
-            raise ValueError(f"timestep_dim is {self.timestep_dim}: use an even one, at least 4")
+            raise ConfigError(f"timestep_dim is {self.timestep_dim}: use an even one, at least 4")
         if self.kernel_size % 2 == 0:
-            raise ValueError(f"kernel_size is {self.kernel_size}: use an odd one")
+            raise ConfigError(f"kernel_size is {self.kernel_size}: use an odd one")
 
     def check_relations(self) -> None:
-        """Raises ValueError, which names both, for two fields that contradict each other."""
+        """Raises ConfigError, which names both, for two fields that contradict each other."""
         H, To, Ta = self.horizon, self.n_obs_steps, self.n_action_steps
         most = H - To + 1
         if Ta > most:
-            raise ValueError(f"n_action_steps {Ta}: horizon {H} has {most} after observation {To}")
-        halvings = len(self.unet_widths) - 1
-        if H % 2**halvings:
-            raise ValueError(
-                f"horizon {H} cannot be halved {halvings} times, as between the "
-                f"{halvings + 1} levels of unet_widths: use a multiple of {2**halvings}"
+            raise ConfigError(f"n_action_steps {Ta}: horizon {H} has {most} after observation {To}")
+        levels = len(self.unet_widths)
+        if H % 2 ** (levels - 1):
+            raise ConfigError(
+                f"horizon {H} is no multiple of {2 ** (levels - 1)}: it is halved between the "
+                f"{levels} levels of unet_widths"
             )
         if self.diffusion_steps % self.inference_steps:
-            raise ValueError(
+            raise ConfigError(
                 f"diffusion_steps {self.diffusion_steps} is no multiple of "
                 f"inference_steps {self.inference_steps}"
             )
         if self.demo_dim % self.vmt_heads:
-            raise ValueError(
+            raise ConfigError(
                 f"demo_dim {self.demo_dim} is no multiple of vmt_heads {self.vmt_heads}"
             )
         if self.condition_dim % self.u2t_heads:
-            raise ValueError(
+            raise ConfigError(
                 f"the condition's width {self.condition_dim} (timestep_dim and To observation "
                 f"features) is no multiple of u2t_heads {self.u2t_heads}"
             )
         for width in self.unet_widths:
             if width % self.n_groups:
-                raise ValueError(f"unet_widths {width} is no multiple of n_groups {self.n_groups}")
+                raise ConfigError(f"unet_widths {width} is no multiple of n_groups {self.n_groups}")
 
     @property
     def observation_feature_dim(self) -> int:
@@ -161,7 +168,7 @@ class Attention(nn.Module):
     def __init__(self, width: int, heads: int):
         super().__init__()
         if width % heads:
-            raise ValueError(f"an attention of width {width} cannot have {heads} heads")
+            raise ConfigError(f"an attention of width {width} cannot have {heads} heads")
         self.heads = heads
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
@@ -597,7 +604,7 @@ Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None:
 class DAMIPolicy(nn.Module):
     """The policy: two observations, an instruction and a demonstration in; actions out.
 
-    Raises ValueError for a configuration of another policy, or one that this class cannot have.
+    Raises ConfigError for a configuration of another policy, or one that this class cannot have.
     """
 
     # What a subclass may say otherwise:
@@ -624,18 +631,18 @@ class DAMIPolicy(nn.Module):
         )
 
     def check_config(self) -> None:
-        """Raises ValueError for a configuration that names another class, or does not fit this."""
+        """Raises ConfigError for a configuration that names another class, or does not fit this."""
         config, name = self.config, self.config.policy
         if POLICIES[name] is not type(self):
-            raise ValueError(
+            raise ConfigError(
                 f"policy {name!r} is a {POLICIES[name].__name__} and no {type(self).__name__}: "
                 "use build_policy, or name this class in model.POLICIES"
             )
         if config.reads_task and not self.reads_task:
-            raise ValueError(f"{name} reads no task: use demo_encoder none and tcfm none")
+            raise ConfigError(f"{name} reads no task: use demo_encoder none and tcfm none")
         for field, value in self.requires.items():
             if getattr(config, field) != value:
-                raise ValueError(f"{name} needs {field} {value}, not {getattr(config, field)}")
+                raise ConfigError(f"{name} needs {field} {value}, not {getattr(config, field)}")
 
     @property
     def reads_task(self) -> bool:
@@ -872,7 +879,7 @@ def choices() -> dict[str, tuple[str, ...]]:
 def build_policy(config: PolicyConfig) -> DAMIPolicy:
     """The policy that a configuration names, with fresh weights.
 
-    Raises ValueError, as the policy's class does, for a configuration that does not fit it.
+    Raises ConfigError, as the policy's class does, for a configuration that does not fit it.
     """
     return POLICIES[config.policy](config)
 
@@ -973,12 +980,11 @@ def load(
 
     try:
         config = replace(PolicyConfig(**content.pop("config")), **config_overrides)
-        policy = restore_policy(config, content.pop("model"), device)
-    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ConfigError) as error:  # TypeError: other fields
         raise CheckpointError(
             f"{path}: weights and configuration do not fit: {one_line(error)}"
         ) from error
-    return policy, content
+    return restore_policy(path, config, content.pop("model", {}), device), content
 
 
 def read_archive(path: Path, device: str | torch.device) -> Any:
@@ -1003,12 +1009,18 @@ def read_archive(path: Path, device: str | torch.device) -> Any:
 
 
 def restore_policy(
-    config: PolicyConfig, weights: dict[str, Tensor], device: str | torch.device
+    path: Path, config: PolicyConfig, weights: dict[str, Tensor], device: str | torch.device
 ) -> DAMIPolicy:
-    """A policy with these weights, in evaluation mode; an error of PyTorch's where they differ."""
-    with torch.device("meta"):  # takes no memory, for a size that the file may not hold
+    """The policy of a file, in evaluation mode; CheckpointError where the weights do not fit it."""
+    try:
+        with torch.device("meta"):  # takes no memory, for a size that the file may not hold
+            policy = build_policy(config)
         sizes = {name: x.to("meta") for name, x in weights.items()}
-        build_policy(config).load_state_dict(sizes)
+        policy.load_state_dict(sizes)
+    except (ConfigError, RuntimeError) as error:  # RuntimeError: other names or shapes
+        raise CheckpointError(
+            f"{path}: weights and configuration do not fit: {one_line(error)}"
+        ) from error
     policy = build_policy(config).to(device)
     policy.load_state_dict(weights)
     return policy.eval()

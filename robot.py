@@ -45,11 +45,15 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation  # scipy comes with metaworld
 
+import baselines  # noqa: F401  its policies are registered
+import common
 import data
-import scripts
-from clip import text_features
-from data import Demonstrations
-from scripts import load_checkpoint, setting
+import model
+import report
+from clip import TextWeightsError, text_features
+from common import UserError, setting
+from data import Demonstrations, RecordingError
+from model import CheckpointError
 
 STATE_DIM = ACTION_DIM = 7
 
@@ -150,12 +154,12 @@ def no_pose(matrix: list) -> str | None:
 
 
 def load_settings(path: str | Path) -> Settings:
-    """Reads --config. ValueError, one line: missing, unknown, of the wrong type, out of range."""
+    """Reads --config. UserError, one line: missing, unknown, of the wrong type, out of range."""
     try:
         return Settings(**json.loads(Path(path).read_text()))
     except (TypeError, ValueError) as error:
         reason = str(error).removeprefix("Settings.__init__() ")
-        raise ValueError(f"{path}: {reason} (an example is assets/robot.json)") from None
+        raise UserError(f"{path}: {reason} (an example is assets/robot.json)") from None
 
 
 # ---- RTDE: the controller's real-time data exchange ----------------------------------------------
@@ -471,7 +475,7 @@ class Gripper:
             else:
                 self.port = Bridge(host, settings.gripper_port, timeout)
         except ImportError:
-            raise ValueError("a gripper on a serial port needs `pip install pyserial`") from None
+            raise UserError("a gripper on a serial port needs `pip install pyserial`") from None
         except OSError as error:  # of pyserial, too
             raise RobotError(f"the gripper at {self.where} cannot be reached: {error}") from None
         self.close = self.port.close
@@ -577,7 +581,7 @@ class RealSense:
         try:
             import pyrealsense2 as rs
         except ImportError:
-            raise ValueError("`pip install pyrealsense2`, or name a recorded --camera") from None
+            raise UserError("`pip install pyrealsense2`, or name a recorded --camera") from None
         self.pipeline, config = rs.pipeline(), rs.config()
         config.enable_stream(rs.stream.depth, width, height, rs.format.z16, hz)
         try:
@@ -620,7 +624,7 @@ class RecordedCamera:
                 raise TypeError(f"intrinsics are {len(self.intrinsics)} numbers")
         except Exception as error:  # numpy and zipfile raise many types
             what = "no recorded camera: depth (F, H, W) uint16, intrinsics (4,) in an .npz file"
-            raise ValueError(f"{path} is {what} ({error})") from None
+            raise UserError(f"{path} is {what} ({error})") from None
         self.images, self.close = itertools.cycle(depth), lambda: None
 
     def read(self) -> np.ndarray:
@@ -951,7 +955,7 @@ class Cell:
             self.gripper.initialize()
 
     def made_with(self, recording: Demonstrations | None = None) -> dict:
-        """What recordings tell of the robot. ValueError for one that was made with another."""
+        """What recordings tell of the robot. UserError for one that was made with another."""
         v, settings = self.rtde.state(self.settings.max_state_age_s).values, self.settings
         now = {"policy_hz": float(settings.policy_hz), "payload_kg": round(float(v["payload"]), 3)}
         now["tcp_offset"] = v["tcp_offset"].round(4).tolist()
@@ -961,7 +965,7 @@ class Cell:
         for name, value in now.items():
             if recording and (found := recording.meta.get(name)) != value:
                 made = f"{recording.task} was recorded with {name} {found}"
-                raise ValueError(f"{made}, now it is {value}: set it as it was, or record again")
+                raise UserError(f"{made}, now it is {value}: set it as it was, or record again")
         return now | boxes(settings)
 
 
@@ -975,7 +979,7 @@ def boxes(settings: Settings) -> dict:
 def connect(args: argparse.Namespace, settings: Settings, write: bool) -> Iterator[Cell]:
     """Camera, gripper and arm; whatever was opened is closed again."""
     if args.camera and write and args.host not in ("localhost", "127.0.0.1"):
-        raise ValueError("--camera shows an arm what was long ago: leave it out, or add --dry-run")
+        raise UserError("--camera shows an arm what was long ago: leave it out, or add --dry-run")
     with ExitStack() as stack:
         camera = RecordedCamera(args.camera) if args.camera else RealSense()
         stack.callback(camera.close)
@@ -1008,7 +1012,7 @@ def save(out: Path, recording: Demonstrations) -> Demonstrations:
     try:
         data.save_demonstrations(out, recording)
     except OSError as error:
-        raise OSError(f"{out} cannot be written: {error.strerror}") from error
+        raise UserError(f"{out} cannot be written: {error.strerror}") from error
     return recording
 
 
@@ -1017,19 +1021,20 @@ def save(out: Path, recording: Demonstrations) -> Demonstrations:
 
 def run(args: argparse.Namespace, settings: Settings) -> None:
     """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and again."""
-    scripts.pick_device(args.device)
-    policy, info = load_checkpoint(args.checkpoint, args.device, needs=("text_weights",))
+    common.pick_device(args.device)
+    policy, info = model.load(args.checkpoint, args.device, needs=("text_weights",))
     config, mine = policy.config, (STATE_DIM, ACTION_DIM, settings.num_points)
     needed = (config.state_dim, config.action_dim, config.num_points)
     if needed[:2] != mine[:2] or needed[2] > mine[2]:
         what = f"{args.checkpoint} has {needed} dimensions of state and action, and points"
-        raise ValueError(f"{what}, the robot {mine}: use a policy trained on its recordings")
+        raise UserError(f"{what}, the robot {mine}: use a policy trained on its recordings")
     recording = data.load_demonstrations(args.data)
     if (task := info.get("adapted_to", recording.task)) != recording.task:
-        raise ValueError(f"{args.checkpoint} was adapted to {task}, {args.data} is of another task")
+        raise UserError(f"{args.checkpoint} was adapted to {task}, {args.data} is of another task")
     sampler = data.WindowSampler(recording, config, device=args.device)
     text, _ = text_features([recording.instruction], args.clip_weights, info["text_weights"])
-    text = text * scripts.is_told(info)
+    if not info.get("adaptation", {}).get("instruction", True):  # adapted without it
+        text = torch.zeros_like(text)
     torch.set_num_threads(max(1, (os.cpu_count() or 1) - 1))  # a core is left to the servo stream
     generator = torch.Generator().manual_seed(args.seed)
     demo = sampler.demonstration(sampler.draw_episode(generator))  # held for the whole run
@@ -1057,9 +1062,9 @@ def replay(args: argparse.Namespace, settings: Settings) -> None:
     recording = data.load_demonstrations(args.data)
     dims = recording.state.shape[1], recording.action.shape[1]
     if dims != (STATE_DIM, ACTION_DIM):
-        raise ValueError(f"{args.data} has {dims} dimensions of state and action: of another robot")
+        raise UserError(f"{args.data} has {dims} dimensions of state and action: of another robot")
     if not 0 <= args.episode < len(recording):
-        raise ValueError(f"{args.data} has {len(recording)} episodes: no --episode {args.episode}")
+        raise UserError(f"{args.data} has {len(recording)} episodes: no --episode {args.episode}")
     frames = recording.episode(args.episode)
     actions = recording.action[frames]  # (T, A)
     chunks = iter(np.array_split(actions, math.ceil(len(actions) / 8)))
@@ -1076,7 +1081,7 @@ def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callabl
     name = f"{recording.task}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.npz"
     out = Path(args.out or f"runs/robot/{name}")
     if out.exists():
-        raise ValueError(f"{out} exists: move it, or give another --out")
+        raise UserError(f"{out} exists: move it, or give another --out")
     ended, frames, actions, commanded = "done", [], [], []
     with connect(args, settings, write=not args.dry_run) as cell:
         meta = cell.made_with(recording) | {"made_by": f"robot.{args.command}"}
@@ -1122,7 +1127,7 @@ def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callabl
                 try:
                     save(out, to_recording(about, frames[:count], actions[:count]))
                     print(f"wrote {out}")
-                except (OSError, ValueError) as error:
+                except (UserError, RecordingError) as error:
                     warn(str(error))
             print(servo.report())
 
@@ -1134,7 +1139,7 @@ class Keys:
     """The keys pressed so far, one at a time, without waiting: of a terminal, or of stdin."""
 
     def __enter__(self) -> Keys:
-        import termios  # Windows has neither: scripts.py says so
+        import termios  # Windows has neither
         import tty
 
         self.old = termios.tcgetattr(sys.stdin) if sys.stdin.isatty() else None
@@ -1162,17 +1167,17 @@ class Keys:
 def record(args: argparse.Namespace, settings: Settings) -> None:
     """Records demonstrations by hand guidance: the arm is free, keys begin and end an episode."""
     if not re.fullmatch(data.NAME, args.task):
-        raise ValueError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
+        raise UserError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
     out = Path(args.out or f"demos/{args.task}.npz")
     if out.exists() and not args.append:
-        raise ValueError(f"{out} exists: add --append, move it, or give another --out")
+        raise UserError(f"{out} exists: add --append, move it, or give another --out")
     kept = data.load_demonstrations(out) if out.exists() else None
     if kept and (kept.task, kept.instruction) != (args.task, args.instruction):
-        raise ValueError(f"{out} holds {kept.task}, {kept.instruction!r}: use another --out")
+        raise UserError(f"{out} holds {kept.task}, {kept.instruction!r}: use another --out")
     if kept and (n := kept.points.shape[1]) != settings.num_points:
-        raise ValueError(f"{out} has clouds of {n} points: set num_points so, or use another --out")
+        raise UserError(f"{out} has clouds of {n} points: set num_points so, or use another --out")
     moves, count, due, frames, grip = not args.dry_run, 0, time.monotonic(), None, []
-    with scripts.locked(out.parent), connect(args, settings, write=moves) as cell, Keys() as keys:
+    with common.locked(out.parent), connect(args, settings, write=moves) as cell, Keys() as keys:
         meta = cell.made_with(kept) | {"made_by": "robot.record", "camera": args.camera}
         cell.prepare(moves)
         closed = float(cell.gripper.read() > 0.5)
@@ -1262,7 +1267,7 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
         some = points[:: math.ceil(len(points) / SAMPLED_FROM)]
         frame = Frame(0.0, some, len(kept), np.append(state.pose, 0.0))
         about = ("check", "the robot's base frame", meta | {"positions_in_state": 1})
-        scripts.draw_demonstration(to_recording(about, [frame], np.zeros((1, 7))), args.picture)
+        report.plot_demonstration(to_recording(about, [frame], np.zeros((1, 7))), args.picture)
         print(f"wrote {args.picture}")
     if trouble:
         raise RobotError(f"the arm cannot be moved: {trouble}")
@@ -1329,4 +1334,6 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    scripts.command_line(main, RobotError)
+    common.command_line(
+        main, errors=(RobotError, RecordingError, CheckpointError, TextWeightsError)
+    )

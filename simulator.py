@@ -23,7 +23,7 @@ import filelock
 import numpy as np
 
 from common import UserError, choose, command_line, format_table, report_progress, run_jobs
-from data import Demonstrations, load_demonstrations, save_demonstrations
+from data import Demonstrations, RecordingError, load_demonstrations, save_demonstrations
 
 # ---- What a simulator is -------------------------------------------------------------------------
 
@@ -63,14 +63,14 @@ class Environment(Protocol):
 class Simulator(Protocol):
     """A simulator's tasks, and how to make their environments.
 
-    It is sent to worker processes: an object of a module's class, small, that holds no environment.
+    It is pickled for worker processes: it is small, and its class stands in a module.
     """
 
     name: str
-    instructions: dict[str, str]  # task -> what the robot is told to do
-    recipe: dict[str, Any]  # of recordings, for their meta: at least "simulator" and "num_points"
-    packages: Sequence[str]  # those whose versions a recording's meta tells
-    episode_steps: int  # after so many an episode is truncated
+    instructions: dict[str, str]  # task -> what the robot is told; its order decides the seeds
+    recipe: dict[str, Any]  # how recordings are made: "simulator" (the name), "num_points", ...
+    packages: Sequence[str]  # names of those whose versions stand in a recording
+    episode_steps: int  # after so many steps an episode is truncated
 
     def tasks(self, suite: str) -> tuple[list[str], list[str]]:
         """Returns a suite's (base, novel) tasks: those to train on, and those to adapt to."""
@@ -139,8 +139,8 @@ def seeds_of_a_task(simulator: Simulator) -> int:
 def demonstration_seed(simulator: Simulator, task: str, seed: int, attempt: int) -> int:
     """Returns the episode seed of one attempt at a demonstration, below 10**8.
 
-    It differs from task to task: some draw their goals alike, and would show the same ten. Raises
-    ValueError for an attempt that would have a seed of the next task.
+    No two tasks share a seed: some tasks draw their goals alike, so that their demonstrations would
+    have the same goals. Raises ValueError for an attempt that would have a seed of the next task.
     """
     seeds = seeds_of_a_task(simulator)
     if not 0 <= attempt < seeds:
@@ -152,11 +152,11 @@ def demonstration_seed(simulator: Simulator, task: str, seed: int, attempt: int)
     return episode_seed(seed, first + attempt)
 
 
-# ---- Recordings of simulators --------------------------------------------------------------------
+# ---- How a recording was made --------------------------------------------------------------------
 
 
 def made_by_simulator(demonstrations: Demonstrations) -> bool:
-    """Whether a recording was made by `collect`; otherwise it is somebody's own."""
+    """Whether a recording was made by `collect`, and not by a robot or by other software."""
     return "simulator" in demonstrations.meta
 
 
@@ -243,7 +243,10 @@ def collect(
 def missing_tasks(
     simulator: Simulator, paths: dict[str, Path], episodes: int, seed: int
 ) -> list[str]:
-    """Returns the tasks whose file (task -> path) is not there, or holds too few episodes."""
+    """Returns the tasks whose file is not there or holds too few episodes; paths: task -> file.
+
+    Raises UserError for a file that was made in another way.
+    """
     missing = []
     for task, path in paths.items():
         if not path.exists():
@@ -350,97 +353,6 @@ def record_episode(env: Environment, seed: int) -> tuple[dict[str, np.ndarray], 
     return arrays, success_frame
 
 
-# ---- Old names, until their callers are rewritten ------------------------------------------------
-#
-# train.py, finetune.py, evaluate.py, report.py, the tutorial and some tests still know Meta-World
-# as this module. With them this whole block goes.
-
-import inspect  # noqa: E402
-import sys  # noqa: E402
-import types  # noqa: E402
-from dataclasses import replace  # noqa: E402
-from functools import wraps  # noqa: E402
-
-OLD_NAMES = ("SUITES", "INSTRUCTIONS", "EPISODE_STEPS", "RECIPE", "MetaWorldPointCloudEnv")
-OLD_NAMES += ("RayCastCamera",)
-
-
-class ModuleWithOldNames(types.ModuleType):
-    def __getattr__(self, name: str) -> Any:
-        if name not in OLD_NAMES:
-            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        import metaworld_env
-
-        return getattr(metaworld_env, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name == "EPISODE_STEPS":
-            import metaworld_env
-
-            metaworld_env.EPISODE_STEPS = value
-            metaworld_env.MetaWorldPointCloudEnv.__init__.__kwdefaults__["episode_steps"] = value
-        else:
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = ModuleWithOldNames
-
-
-def of_meta_world(function: Callable, *old_parameters: str) -> Callable:
-    """Lets a function also be called without its simulator, and by position."""
-
-    @wraps(function)
-    def called(*arguments: Any, **options: Any) -> Any:
-        if not hasattr(next(iter(arguments), options.get("simulator")), "instructions"):
-            options = {**dict(zip(old_parameters, arguments)), **options}
-            return function(meta_world(), **options)
-        return function(*arguments, **options)
-
-    return called
-
-
-collect = of_meta_world(collect, *list(inspect.signature(collect).parameters)[1:])
-check_task = of_meta_world(check_task, "task")
-demonstration_seed = of_meta_world(demonstration_seed, "task", "seed", "attempt")
-
-
-def suite_tasks(suite: str) -> tuple[list[str], list[str]]:
-    return simulator_of(suite).tasks(suite)
-
-
-def is_simulated(recorded: Demonstrations, path: str | Path) -> bool:
-    """Whether a recording is of a task of Meta-World; UserError if it only has such a name."""
-    simulator = meta_world()
-    if recorded.task not in simulator.instructions:
-        return False
-    found = {**recorded.meta, "task": recorded.task}
-    other = [name for name, value in simulator.recipe.items() if found.get(name) != value]
-    if other:
-        what = f"{path} is not Meta-World's {recorded.task} as recorded here"
-        what += f" (another {', '.join(other)})"
-        raise UserError(f"{what}: record it again, or give your task, and its file, another name")
-    return True
-
-
-def own_recordings(folder: str | Path) -> dict[str, Path]:
-    """Task -> file of the recordings in a folder; none if they are Meta-World's, by their names."""
-    paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
-    known, problem = [task for task in paths if task in meta_world().instructions], None
-    if Path(folder).is_file():
-        problem = f"{folder} is a file: name its folder, all recordings in it are trained on"
-    elif not Path(folder).is_dir():
-        problem = f"there is no folder {folder}: with --suite ml10, experts fill it"
-    elif not paths:
-        problem = f"{folder} holds no recordings (.npz): with --suite ml10, experts fill it"
-    elif known and len(known) < len(paths):
-        problem = f"{folder} mixes your recordings with {known[0]}: move one kind elsewhere"
-    if problem:
-        raise UserError(problem)
-    for task in known:
-        is_simulated(replace(load_demonstrations(paths[task]), task=task), paths[task])
-    return {} if known else paths
-
-
 # ---- Command line --------------------------------------------------------------------------------
 
 
@@ -485,4 +397,4 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, errors=(ValueError,))  # RecordingError
+    command_line(main, errors=(RecordingError,))

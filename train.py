@@ -7,17 +7,25 @@
     python train.py --data recordings                   # own tasks: every recording in a folder
     torchrun --nproc-per-node 4 train.py --suite ml10   # tasks shared among 4 processes
 
+`meta_train` is Algorithm 1, `task_batch` draws what it reads; `run` does what happens around it.
+
 Whatever is random in outer step k follows from (seed, k, task) alone. On a CPU, with as many
 threads, a run that was killed and resumed therefore ends with the same bits as one that was not,
 and tasks may be shared among processes without changing what they draw.
 """
 
 import argparse
+import hashlib
+import json
 import math
+import os
+import shlex
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,27 +37,54 @@ from torch.func import functional_call
 from torch.optim.swa_utils import AveragedModel
 
 import baselines
+import common
 import evaluate
+import model
 import report
-import scripts
-from data import WindowSampler, load_demonstrations
+from clip import TextWeightsError
+from common import (
+    CUDAGraphed,
+    StopRequest,
+    UserError,
+    append_json,
+    choose,
+    read_json_lines,
+    setting,
+)
+from data import (
+    Demonstrations,
+    RecordingError,
+    WindowSampler,
+    hold_out,
+    load_demonstrations,
+    write_text,
+)
 from maml import meta_gradient
-from model import PRESETS, TASK_INPUTS, DAMIPolicy, PolicyConfig, ema_model, split
-from scripts import Flags, choose, command_line, progress_bar, save_checkpoint, setting
-from simulator import SUITES, collect, own_recordings, suite_tasks
+from model import (
+    TASK_INPUTS,
+    CheckpointError,
+    ConfigError,
+    DAMIPolicy,
+    PolicyConfig,
+    ema_model,
+    split,
+)
+from report import Successes
+from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
 
 # ---- Settings ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Settings(Flags):
-    """What a run is made of. Each field is a flag, and is kept in every checkpoint (`arguments`).
+class Settings:
+    """What a training is made of. Each field made by `setting` is a flag.
 
-    The defaults are the paper's (3000 epochs of 18 outer steps), but for the warm-up, DP3's.
+    Every checkpoint keeps all of them (`arguments`). The defaults are the paper's, whose 3000
+    epochs are of 18 outer steps each, but for the warm-up, which is DP3's.
     """
 
-    suite: str = setting("ml10", "ml10 or ml45 (default: ml10, or own recordings in --data)")
-    preset: str = setting("paper", "paper, small or tiny (default: paper on CUDA, else small)")
+    suite: str = "ml10"  # or "own", for own recordings
+    preset: str = "paper"
     seed: int = setting(0, "of weights, batches and noise", least=0, most=2**32 - 1)
     maml: str = setting("second", "order of the meta-gradient", choices=("second", "first", "off"))
     steps: int = setting(54_000, "outer steps", least=1)
@@ -58,30 +93,46 @@ class Settings(Flags):
     inner_lr: float = setting(1e-4, "learning rate of the inner step", least=0)
     lr: float = setting(1e-4, "peak learning rate of AdamW", least=0)
     warmup: int = setting(500, "steps of linear warm-up", least=0)
-    multi_task_share: float = setting(0.0, "first steps without an inner step", least=0, most=1)
+    pretrain_fraction: float = setting(
+        0.0, "fraction of the steps, the first ones, without an inner step", least=0, most=1
+    )
     vectorize: int = setting(1, "tasks that run at once; memory is for so many", least=1)
     bfloat16: bool = setting(False, "products of steps without an inner step in bfloat16")
-    after_success: int | None = setting(None, "windows begin at most so much later", least=0)
+    after_success: int | None = setting(
+        None, "frames after its episode's first success that a window may begin", least=0
+    )
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
-    instruction_dropout: float = setting(0.0, "share of batches without it", least=0, most=1)
-    support_only: float = setting(0.0, "share of inner steps told nothing else", least=0, most=1)
+    instruction_dropout: float = setting(
+        0.0, "fraction of the batches without instruction", least=0, most=1
+    )
+    task_dropout: float = setting(
+        0.0, "fraction of the inner steps without instruction and demonstration", least=0, most=1
+    )
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
-    held_out: int = setting(0, "of them, the last so many only judge", least=0)
+    held_out: int = setting(0, "of them, the last so many are only for measuring", least=0)
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
     episodes: int = setting(20, "evaluation episodes a task; 0: never evaluate", least=0)
 
+    def __post_init__(self) -> None:
+        common.check_settings(self)
 
-# What a preset changes; the architecture of the same name is in model.PRESETS.
+    @property
+    def pretrain_steps(self) -> int:
+        """So many steps, the first ones, are without an inner step."""
+        return self.steps if self.maml == "off" else round(self.pretrain_fraction * self.steps)
+
+
+# What a preset changes; the architecture of the same name is in baselines.PRESETS.
 # fmt: off
 SETTINGS = {
     "paper": Settings(),
     "small": Settings(
         preset="small", steps=10_000, support=4, query=12, lr=1e-3, warmup=100,
-        multi_task_share=0.8,  # a quarter of the time a step, and nearly the same gradient
+        pretrain_fraction=0.8,  # a quarter of the time a step, and nearly the same gradient
         after_success=20,  # three in five of the experts' frames are later
         instruction_dropout=0.2,  # or the demonstration is never read
-        support_only=0.25, inner_lr=3e-3,  # told nothing, a step has all to teach: RESULTS.md
+        task_dropout=0.25, inner_lr=3e-3,  # where a step is told nothing it has all to teach
         vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=10_000,
     ),
     "tiny": Settings(
@@ -90,10 +141,6 @@ SETTINGS = {
     ),
 }
 # fmt: on
-SAVE_SECONDS = 20  # between two savings of last.pt: what a killed run loses at most
-# Old name, until the tests of this file ask model.TASK_INPUTS:
-PER_WINDOW = ("points", "state", "action", "noise", "timesteps")
-PER_WINDOW += ("times", "drop_path", "cutoffs", "mask")
 
 
 # ---- Algorithm 1 ---------------------------------------------------------------------------------
@@ -110,24 +157,33 @@ def task_batch(
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
-    Where the instruction names the task, nothing else need be read. In a share of the batches it
-    is therefore left out (zeros), and only the demonstration tells the task. Where an `inner` step
-    follows, a share sees neither: there the support windows alone tell it.
+    Where the instruction names the task, a policy need read nothing else. In a fraction of the
+    batches (`instruction_dropout`) zeros therefore take its place, and only the demonstration tells
+    the task. Where an inner step follows (`inner`), in a fraction of them (`task_dropout`) the
+    demonstration is zeros as well: then only the support windows tell the task.
 
-    Returns the keyword arguments of `policy.loss`. They follow from `seed` alone.
+    Returns the keyword arguments of `policy.loss`, on the device of `text`. They follow from `seed`
+    alone.
     """
-    for_batch, for_shares = np.random.SeedSequence(seed).generate_state(2, np.uint64)
-    generator = torch.Generator().manual_seed(int(for_batch))
-    drop, _, hide = torch.rand(3, generator=torch.Generator().manual_seed(int(for_shares)))
-    hide = inner and hide < settings.support_only  # `_` is free: RESULTS.md's runs drew three
-    windows = sampler.batch(n, generator)
-    if hide:
-        shown = [name for name in windows if name in TASK_INPUTS]
-        windows |= {name: torch.zeros_like(windows[name]) for name in shown}
-    if hide or drop < settings.instruction_dropout:
-        text = torch.zeros_like(text)
-    drawn = {"text": text[None], **windows, **policy.draw_noise_and_timesteps(n, generator)}
-    return {name: x.to(text.device) for name, x in drawn.items()}
+    seed_of_batch, seed_of_dropout = np.random.SeedSequence(seed).generate_state(2, np.uint64)
+    generator = torch.Generator().manual_seed(int(seed_of_batch))
+    batch = {
+        "text": text[None],
+        **sampler.batch(n, generator),
+        **policy.draw_noise_and_timesteps(n, generator),
+    }
+
+    generator = torch.Generator().manual_seed(int(seed_of_dropout))
+    drop_instruction, drop_task = torch.rand(2, generator=generator)
+    if inner and drop_task < settings.task_dropout:
+        dropped = TASK_INPUTS
+    elif drop_instruction < settings.instruction_dropout:
+        dropped = ("text",)
+    else:
+        dropped = ()
+    for name in dropped:
+        batch[name] = torch.zeros_like(batch[name])
+    return {name: x.to(text.device) for name, x in batch.items()}
 
 
 def multi_task_gradient(
@@ -135,252 +191,711 @@ def multi_task_gradient(
 ) -> tuple[dict[str, Tensor], Tensor]:
     """The gradient of ordinary multi-task training: all windows of all tasks, no inner step.
 
-    `batches` are of `task_batch`, one a task. With `bfloat16` matrix products and convolutions are
-    computed in it, and the gradient stays float32. Returns parameter name -> gradient, loss (1,).
+    `batches` are those of `task_batch`, one for each task. With `bfloat16`, matrix products and
+    convolutions are computed in it, and the gradient stays float32. Returns parameter name ->
+    gradient, and the loss ().
     """
-    if len({batch["demo_points"].shape for batch in batches}) == 1:  # else: of different lengths
+    if len({batch["demo_points"].shape for batch in batches}) == 1:  # demonstrations can be stacked
         batches = [{name: torch.cat([b[name] for b in batches]) for name in batches[0]}]
     with torch.autocast(batches[0]["action"].device.type, torch.bfloat16, enabled=bfloat16):
         loss = torch.stack([policy.loss(**batch) for batch in batches]).mean()
     parameters = dict(policy.named_parameters())
     gradients = torch.autograd.grad(loss, list(parameters.values()))
-    return dict(zip(parameters, gradients)), loss.detach()[None]
+    return dict(zip(parameters, gradients)), loss.detach()
 
 
-def learning_rate(step: int, settings: Settings) -> float:
-    """Linear warm-up, then half a cosine, to zero one step after the last."""
-    peak, steps, warmup = settings.lr, settings.steps, settings.warmup
-    if step < warmup:
-        return peak * (step + 1) / warmup
-    return peak * 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
+def maml_gradient(
+    policy: DAMIPolicy, batches: list[dict[str, Tensor]], settings: Settings, vectorize: int
+) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """The gradient of the query loss through each task's inner step (lines 4 to 19).
 
-
-def initialize(
-    config: PolicyConfig,
-    settings: Settings,
-    samplers: dict[str, WindowSampler],
-    device: torch.device,
-) -> tuple[DAMIPolicy, AveragedModel, torch.optim.Optimizer]:
-    """A fresh policy, normalized to all windows (line 1), its moving average, and AdamW."""
-    torch.manual_seed(settings.seed)
-    policy = baselines.build_policy(config).to(device)
-    policy.normalizer.fit(samplers.values())
-    optimizer = torch.optim.AdamW(
-        policy.parameters(), lr=settings.lr, betas=(0.95, 0.999), weight_decay=1e-6, fused=True
-    )
-    return policy, ema_model(policy), optimizer
-
-
-def meta_train(
-    policy: DAMIPolicy,
-    ema: AveragedModel,
-    optimizer: torch.optim.Optimizer,
-    samplers: dict[str, WindowSampler],
-    text: dict[str, Tensor],
-    settings: Settings,
-    start: int = 0,
-    rank: int = 0,
-    world: int = 1,
-) -> Iterator[tuple[int, dict[str, float]]]:
-    """Algorithm 1: trains `policy` and its average `ema`, from outer step `start` on.
-
-    Args:
-        samplers, text: task -> its windows, and its instruction feature (text_dim,).
-        rank, world: this process's number, and how many share the tasks.
-
-    Yields:
-        (steps done, figures) after each outer step: loss and gradient_norm. Where there is an inner
-        step, loss is the query's after it, and loss_before is the query's before it.
-
-    Raises:
-        ValueError: the loss or its gradient is not finite; this step changed nothing.
+    `batches` are those of `task_batch`, one for each task, `vectorize` of which run at once.
+    Returns parameter name -> gradient, and the query losses after and before the inner step, both
+    (tasks,).
     """
-    params = dict(policy.named_parameters())
-    my_tasks = list(enumerate(samplers))[rank::world]
-    seed, n = settings.seed, settings.support + settings.query
-    multi_task_share = 1.0 if settings.maml == "off" else settings.multi_task_share
-    multi_task_steps = round(multi_task_share * settings.steps)
-
-    # Several tasks at once, if their demonstrations can be stacked.
-    lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
-    at_once = settings.vectorize if len(lengths) == 1 else 1
-    how = {"lr": settings.inner_lr, "first_order": settings.maml == "first", "vectorize": at_once}
 
     def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         return functional_call(policy, params, (), batch)
 
-    def without_inner_step(batches: list[dict[str, Tensor]]) -> tuple:
-        return *multi_task_gradient(policy, batches, settings.bfloat16), {}
+    return meta_gradient(
+        loss_fn,
+        dict(policy.named_parameters()),
+        [split(batch, settings.support) for batch in batches],
+        lr=settings.inner_lr,
+        first_order=settings.maml == "first",
+        vectorize=vectorize,
+    )
 
-    def through_inner_step(batches: list[dict[str, Tensor]]) -> tuple:  # lines 4 to 19
-        pairs = [split(batch, settings.support) for batch in batches]
-        gradients, losses, before = meta_gradient(loss_fn, params, pairs, **how)
-        return gradients, losses, {"loss_before": before.mean()}
 
-    if next(policy.parameters()).is_cuda and world == len(lengths) == 1:  # always equal shapes
-        without_inner_step = scripts.Captured(without_inner_step)
-        through_inner_step = scripts.Captured(through_inner_step)
+def learning_rate(step: int, settings: Settings) -> float:
+    """Linear warm-up, then half a cosine, to zero one step after the last."""
+    if step < settings.warmup:
+        return settings.lr * (step + 1) / settings.warmup
+    progress = (step - settings.warmup) / max(1, settings.steps - settings.warmup)  # 0 to 1
+    return settings.lr * 0.5 * (1 + math.cos(math.pi * progress))
 
-    for step in range(start, settings.steps):  # lines 2, 22
-        inner = step >= multi_task_steps
+
+@dataclass
+class TrainingState:
+    """Everything that training changes: what last.pt keeps, so that a run can go on from it."""
+
+    policy: DAMIPolicy
+    average: AveragedModel  # of the policy; its `.module` is what is kept and rolled out
+    optimizer: torch.optim.Optimizer
+    step: int = 0  # outer steps that are done
+    seconds: float = 0.0  # that they took
+
+
+def start_training(
+    config: PolicyConfig,
+    settings: Settings,
+    samplers: dict[str, WindowSampler],
+    device: str | torch.device = "cpu",
+) -> TrainingState:
+    """Returns a fresh policy, normalized to the data of all tasks (line 1), its average, AdamW."""
+    torch.manual_seed(settings.seed)
+    policy = model.build_policy(config).to(device)
+    policy.normalizer.fit(samplers.values())
+    optimizer = torch.optim.AdamW(
+        policy.parameters(), lr=settings.lr, betas=(0.95, 0.999), weight_decay=1e-6, fused=True
+    )
+    return TrainingState(policy, ema_model(policy), optimizer)
+
+
+def meta_train(
+    state: TrainingState,
+    samplers: dict[str, WindowSampler],
+    text: dict[str, Tensor],
+    settings: Settings,
+    *,
+    rank: int = 0,
+    world: int = 1,
+) -> Iterator[dict[str, float]]:
+    """Algorithm 1: trains the policy of `state`, from its step on.
+
+    Args:
+        state: it is changed in place.
+        samplers, text: task -> its windows, and its instruction feature (text_dim,).
+        rank, world: this process's number, and how many processes share the tasks.
+
+    Yields:
+        Figures of each outer step: loss, gradient_norm and lr. Where there is an inner step, loss
+        is the query loss after it, and loss_before is the query loss before it.
+
+    Raises:
+        UserError: the loss or its gradient is not finite. The step changed nothing then.
+    """
+    policy, parameters = state.policy, dict(state.policy.named_parameters())
+    n = settings.support + settings.query
+    my_tasks = list(enumerate(samplers))[rank::world]
+
+    # Several tasks run at once if their demonstrations have one length, and can be stacked. The
+    # shapes are then the same in every step, so on a GPU each kind of step can be one CUDA graph.
+    lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
+    vectorize = settings.vectorize if len(lengths) == 1 else 1
+    without_inner_step = partial(multi_task_gradient, policy, bfloat16=settings.bfloat16)
+    through_inner_step = partial(maml_gradient, policy, settings=settings, vectorize=vectorize)
+    if next(policy.parameters()).is_cuda and len(lengths) == 1 and world == 1:
+        without_inner_step = CUDAGraphed(without_inner_step)
+        through_inner_step = CUDAGraphed(through_inner_step)
+
+    for step in range(state.step, settings.steps):  # lines 2, 22
+        inner = step >= settings.pretrain_steps
         batches = [  # lines 3 to 6, 9
-            task_batch(policy, samplers[t], text[t], n, (seed, step, i), settings, inner)
+            task_batch(policy, samplers[t], text[t], n, (settings.seed, step, i), settings, inner)
             for i, t in my_tasks
         ]
 
         # The gradient of the mean loss over my tasks
-        gradients, losses, figures = (through_inner_step if inner else without_inner_step)(batches)
-        loss = losses.mean()
+        if inner:
+            gradients, after, before = through_inner_step(batches)  # lines 4 to 19
+            figures = {"loss": after.mean(), "loss_before": before.mean()}
+        else:
+            gradients, loss = without_inner_step(batches)
+            figures = {"loss": loss}
 
-        # The mean over all tasks: the processes' means, weighted by their shares
+        # The mean over all tasks: that of the processes' means, weighted by their numbers of tasks
         if world > 1:
-            for x in (loss, *figures.values(), *gradients.values()):
+            for x in (*figures.values(), *gradients.values()):
                 dist.all_reduce(x.mul_(len(my_tasks) / len(samplers)))
-        norm = torch.nn.utils.get_total_norm(gradients.values())
-        if not torch.isfinite(loss + norm):
-            raise ValueError(
+
+        figures["gradient_norm"] = torch.nn.utils.get_total_norm(gradients.values())
+        if not torch.isfinite(figures["loss"] + figures["gradient_norm"]):
+            raise UserError(
                 f"the loss or its gradient is not finite at step {step + 1}: train again with a "
                 "smaller --lr or --inner-lr, in another --out (what was saved before is whole)"
             )
 
-        # One step of AdamW, and of the moving average, which is what is kept and rolled out
-        for name, parameter in params.items():
+        # One step of AdamW, and one of the moving average, which is what is kept and rolled out
+        for name, parameter in parameters.items():
             parameter.grad = gradients[name]
-        optimizer.param_groups[0]["lr"] = learning_rate(step, settings)
-        optimizer.step()  # line 20
-        ema.update_parameters(policy)  # line 21
-        figures = figures | {"loss": loss, "gradient_norm": norm}
-        yield step + 1, {name: x.item() for name, x in figures.items()}
+        state.optimizer.param_groups[0]["lr"] = lr = learning_rate(step, settings)
+        state.optimizer.step()  # line 20
+        state.average.update_parameters(policy)  # line 21
+        state.step = step + 1
+        yield {**{name: x.item() for name, x in figures.items()}, "lr": lr}
 
 
-# ---- Command line --------------------------------------------------------------------------------
+# ---- Checkpoints, and last.pt, which a run goes on from ------------------------------------------
+
+# last.pt is written every SAVE_SECONDS, which is what a killed run loses at most; but more seldom
+# where a large one is so slow that this would take more than SAVE_SHARE of the time.
+SAVE_SECONDS = 20
+SAVE_SHARE = 0.04
+
+# These may differ when a run is resumed: they change no number, `vectorize` only its last bits.
+FREE_TO_CHANGE = ("vectorize", "checkpoint_every", "evaluate_every", "episodes")
+OF_INNER_STEP = ("maml", "inner_lr", "task_dropout")  # may differ as long as there was none
 
 
-def parse(argv: list[str] | None) -> argparse.Namespace:
+def is_milestone(step: int, settings: Settings) -> bool:
+    """Whether the moving average is kept after this step."""
+    every = (settings.checkpoint_every, settings.evaluate_every)
+    return step == settings.steps or any(step % n == 0 for n in every)
+
+
+def save_average(folder: Path, state: TrainingState, info: dict[str, Any]) -> None:
+    """Writes the moving average, and `info`, to the checkpoint of this step."""
+    model.save(
+        folder / f"ema-{state.step:05d}.pt",
+        state.average.module,
+        step=state.step,
+        seconds=state.seconds,
+        **info,
+    )
+
+
+class Saver:
+    """Writes a run's last.pt, so often that little is lost and so rarely that it takes no time."""
+
+    def __init__(self, path: Path, info: dict[str, Any]) -> None:
+        self.path = path
+        self.info = info
+        self.ended = time.monotonic()
+        self.took = 0.0  # seconds
+
+    def is_due(self) -> bool:
+        waited = time.monotonic() - self.ended
+        return waited > max(SAVE_SECONDS, self.took / SAVE_SHARE)
+
+    def save(self, state: TrainingState) -> None:
+        began = time.monotonic()
+        training = {
+            "policy": state.policy.state_dict(),
+            "optimizer": state.optimizer.state_dict(),
+            "n_averaged": state.average.n_averaged,
+        }
+        model.save(
+            self.path,
+            state.average.module,
+            training=training,
+            step=state.step,
+            seconds=state.seconds,
+            **self.info,
+        )
+        self.ended = time.monotonic()
+        self.took = self.ended - began
+
+
+def restore(
+    path: Path, state: TrainingState, settings: Settings, recordings: str
+) -> dict[str, Any]:
+    """Brings a fresh state to where last.pt left it; returns what else that file says.
+
+    `recordings` is the `fingerprint` of what is trained on. Raises UserError for a run that was
+    started with other settings, or on other recordings.
+    """
+    policy, config = state.policy, state.policy.config
+    averaged, info = model.load(path, policy.normalizer.action_scale.device)
+    if "training" not in info:
+        raise UserError(f"{path} is no last.pt of train.py: there is no training to go on with")
+
+    settings_then = Settings(**info["arguments"])  # what it lacks is newer, and as by default
+    may_differ = set(FREE_TO_CHANGE)
+    if info["step"] <= settings_then.pretrain_steps:
+        may_differ.update(OF_INNER_STEP)
+    changed = []
+    for now, then in ((settings, settings_then), (config, averaged.config)):
+        for name, value in asdict(now).items():
+            if getattr(then, name) != value and name not in may_differ:
+                changed.append(f"{name} {getattr(then, name)} -> {value}")
+    if changed:
+        raise UserError(
+            f"{path.parent} was started with other settings ({', '.join(changed)}): "
+            "give the old ones to resume it"
+        )
+    if info["recordings"] != recordings:
+        raise UserError(f"{path.parent} was started on other recordings: bring those back")
+
+    policy.load_state_dict(info["training"]["policy"])
+    state.average.module.load_state_dict(averaged.state_dict())
+    state.average.n_averaged.copy_(info["training"]["n_averaged"])
+    state.optimizer.load_state_dict(info["training"]["optimizer"])
+    state.step, state.seconds = info["step"], info["seconds"]
+    return info
+
+
+def fingerprint(samplers: dict[str, WindowSampler]) -> str:
+    """A digest of everything that is trained on."""
+    sha = hashlib.sha256()
+    for sampler in samplers.values():
+        sha.update(f"{sampler.task} {sampler.instruction}".encode())
+        if sampler.augment:
+            sha.update(f"{sampler.positions_in_state} {sampler.center.tolist()}".encode())
+        for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
+            sha.update(part.cpu().numpy().tobytes())
+    return sha.hexdigest()
+
+
+# ---- What is measured while a run goes on --------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Rollouts of a run's checkpoints, at the steps where they are due."""
+
+    folder: Path
+    settings: Settings
+    simulator: Simulator | None  # None: own recordings, which are rolled out nowhere
+    recordings: dict[str, Path]
+    text: dict[str, Tensor]
+    workers: int | None
+    device: torch.device
+
+    def run(self, step: int, stop: StopRequest) -> Successes | None:
+        """Rolls out the checkpoint of a step and logs it, unless it was done before.
+
+        Returns None where no evaluation is due. Everything is saved by then: Ctrl-C stops it.
+        """
+        settings = self.settings
+        due = step == settings.steps or (step > 0 and step % settings.evaluate_every == 0)
+        if self.simulator is None or settings.episodes == 0 or not due:
+            return None
+        for line in read_json_lines(self.folder / "metrics.jsonl"):
+            if line["step"] == step and "successes" in line:
+                return line["successes"]
+        try:
+            with stop.suspended():
+                successes = evaluate.evaluate_checkpoint(
+                    checkpoint=self.folder / f"ema-{step:05d}.pt",
+                    simulator=self.simulator,
+                    recordings=self.recordings,
+                    text=self.text,
+                    episodes=settings.episodes,
+                    seed=evaluate.EVALUATION_SEED,
+                    workers=self.workers,
+                    device=self.device,
+                    n_demonstrations=settings.demonstrations - settings.held_out,
+                )
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("all is saved, add --resume to go on") from None
+        append_json(
+            self.folder / "metrics.jsonl",
+            step=step,
+            success=report.mean_success(successes),
+            successes=successes,
+        )
+        return successes
+
+
+def log_heldout_errors(
+    folder: Path,
+    state: TrainingState,
+    train_samplers: dict[str, WindowSampler],
+    heldout_samplers: dict[str, WindowSampler],
+    text: dict[str, Tensor],
+) -> None:
+    """Logs the average policy's action errors on held-out episodes, and writes held-out.md.
+
+    Its table has the errors of the first and of the last step at which they were measured, and
+    those of always doing the mean action.
+    """
+    measured = evaluate.evaluate_heldout(
+        state.average.module, train_samplers, heldout_samplers, text
+    )
+    errors = {task: error for task, (error, _) in measured.items()}
+    append_json(
+        folder / "metrics.jsonl",
+        step=state.step,
+        action_error=float(np.mean(list(errors.values()))),
+        action_errors=errors,
+    )
+    lines = [line for line in read_json_lines(folder / "metrics.jsonl") if "action_errors" in line]
+    columns = {f"step {line['step']}": line["action_errors"] for line in (lines[0], lines[-1])}
+    columns["the mean action"] = {task: error for task, (_, error) in measured.items()}
+    table = report.heldout_table(columns)
+    write_text(folder / "held-out.md", f"{table}\n\nMean absolute error, in the action's unit.\n")
+
+
+def report_training(
+    folder: Path,
+    settings: Settings,
+    policy: str,
+    seconds: float,
+    provenance: dict[str, Any],
+    successes: Successes | None,
+) -> None:
+    """Writes and prints the results of a finished run, and prints what can be done with it."""
+    if successes is not None:
+        report.plot_curves(folder)
+        table = report.write_report(
+            folder,
+            {"last checkpoint": successes},
+            {
+                "title": f"{settings.suite}, base tasks, {settings.preset}, {policy}",
+                "seed": evaluate.EVALUATION_SEED,
+                "episodes a task": settings.episodes,
+                "training": f"{seconds / 60:.1f} min",
+                "training seed": settings.seed,
+                **provenance,
+            },
+            paper=report.paper_columns(settings.suite, [policy]),
+        )
+        print(f"\n{table}")
+    if (folder / "held-out.md").exists():
+        print(f"\n{(folder / 'held-out.md').read_text().rstrip()}")
+
+    files = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    print(f"\n{folder} is finished: {', '.join(files)}")
+    new = "--data NEW.npz" if settings.suite == "own" else f"--task novel --suite {settings.suite}"
+    print(f"next: python finetune.py {new} --checkpoint {shlex.quote(str(folder))}")
+
+
+# ---- From the command line to a run --------------------------------------------------------------
+
+OWN_FRAMES = 500  # of a demonstration on a real robot: the paper's positions there
+ARCHITECTURE = {  # fields of PolicyConfig that are flags -> what they may be
+    "policy": tuple(baselines.PRESETS),
+    "demo_encoder": (*model.demo_encoders, "none"),
+    "denoiser": tuple(model.denoisers),
+    "tcfm": ("down", "mid", "up", "none"),
+    "sampler": ("ddim", "dp3"),
+    "num_points": None,  # any number
+}
+
+
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Meta-trains a policy on a suite (Algorithm 1).")
-    add = parser.add_argument_group("run").add_argument
-    add("--data", help="folder of the demonstrations (default: data)")
-    add("--out", help="folder of the run (default: runs/SUITE-PRESET-seedSEED)")
-    add("--resume", action="store_true", help="go on from the run's last.pt")
-    scripts.add_common_flags(add)
-    scripts.add_architecture_flags(parser)
-    Settings.add_flags(parser.add_argument_group("settings (default: the preset's)"), SETTINGS)
+    group = parser.add_argument_group("run")
+    group.add_argument(
+        "--suite", help=f"{', '.join(SIMULATORS)} (default: ml10, or own recordings in --data)"
+    )
+    group.add_argument(
+        "--preset", help="paper, small or tiny (default: paper on CUDA, small on a CPU)"
+    )
+    group.add_argument("--data", help="folder of the demonstrations (default: data)")
+    group.add_argument("--out", help="folder of the run (default: runs/SUITE-PRESET-seedSEED)")
+    group.add_argument("--resume", action="store_true", help="go on from the run's last.pt")
+    common.add_common_flags(group)
+
+    group = parser.add_argument_group("architecture (default: the preset's)")
+    for name, choices in ARCHITECTURE.items():
+        values = {preset: getattr(config, name) for preset, config in model.PRESETS.items()}
+        group.add_argument(
+            common.flag_name(name),
+            type=str if choices else int,
+            choices=choices,
+            help="see model.PolicyConfig" + common.describe_presets(values),
+        )
+    group = parser.add_argument_group("settings (default: the preset's)")
+    common.add_settings(group, Settings, SETTINGS)
     return parser.parse_args(argv)
 
 
-def main(argv: list[str] | None = None) -> None:
-    args = parse(argv)
-    device = scripts.pick_device(args.device, args.threads)
-    own = own_recordings(args.data) if args.data and not args.suite else {}  # task -> file
-    default = "paper" if device.type == "cuda" else "small"
-    preset = choose(args.preset or default, PRESETS, "preset")
-    suite = "own" if own else choose(args.suite or "ml10", SUITES, "suite")
-    settings, policy = SETTINGS[preset], args.policy or "dami"
-    if policy != "dami" or args.demo_encoder == "none":  # the instruction alone tells the task
-        settings = replace(settings, instruction_dropout=0.0, support_only=0.0)
-    settings = settings.given(args, suite=suite)
-    name = preset if policy == "dami" else f"{policy}-{preset}"
-    if own:  # all demonstrations unless told otherwise, and no simulator to be rolled out in
-        settings = replace(settings, demonstrations=args.demonstrations, episodes=0)
-    tasks = list(own) or suite_tasks(suite)[0]
-    paths = own or {task: Path(args.data or "data") / f"{task}.npz" for task in tasks}
-    folder = Path(args.out or f"runs/{suite}-{name}-seed{settings.seed}")
+def own_recordings(folder: Path) -> dict[str, Path]:
+    """Task -> file of the recordings in a folder, none of which was made by a simulator."""
+    if folder.is_file():
+        raise UserError(f"{folder} is a file: name its folder, all recordings in it are trained on")
+    if not folder.is_dir():
+        raise UserError(f"there is no folder {folder}: with --suite ml10, experts fill it")
+    paths = {path.stem: path for path in sorted(folder.glob("*.npz"))}
+    if not paths:
+        raise UserError(f"{folder} holds no recordings (.npz): with --suite ml10, experts fill it")
+    for path in paths.values():
+        if made_by_simulator(load_demonstrations(path)):
+            raise UserError(
+                f"{path} was recorded in a simulator: name its suite, for example --suite ml10, or "
+                "move it to train on the other recordings"
+            )
+    return paths
 
-    device, rank, world = scripts.join_processes(device, len(tasks))
-    with scripts.locked(folder) if rank == 0 else nullcontext():
-        if rank == 0:
-            where = f"{device} ({scripts.hardware(device)})"
-            print(f"preset {name} on {where}, {len(tasks)} tasks, in {folder}", flush=True)
-            scripts.check_run(folder, args.resume)
-            if not own:
-                collect(tasks, args.data or "data", settings.demonstrations, workers=args.workers)
-        if world > 1:
-            dist.barrier()
-        facts = scripts.report_facts("train.py", argv, device)
-        run(args, settings, paths, folder, facts, device, rank, world)
-        if world > 1:
-            dist.destroy_process_group()
+
+def choose_architecture(args: argparse.Namespace, preset: str) -> PolicyConfig:
+    """The preset's architecture, with the flags that were given."""
+    flags = {name: getattr(args, name) for name in ARCHITECTURE}
+    config = baselines.PRESETS[args.policy or "dami"][preset]
+    try:
+        config = replace(config, **{name: x for name, x in flags.items() if x is not None})
+        build_empty(config)
+    except ConfigError as error:
+        raise UserError(str(error)) from error
+    return config
+
+
+def build_empty(config: PolicyConfig) -> DAMIPolicy:
+    """A policy whose weights are neither drawn nor stored, to ask what it is like."""
+    with torch.device("meta"):
+        return model.build_policy(config)
+
+
+def choose_settings(
+    args: argparse.Namespace, preset: str, suite: str, config: PolicyConfig
+) -> Settings:
+    """The preset's settings, with the flags that were given."""
+    settings = replace(SETTINGS[preset], suite=suite)
+    if suite == "own":  # all demonstrations, and no simulator to be rolled out in
+        settings = replace(settings, demonstrations=None, episodes=0)
+    if not build_empty(config).reads_demonstration:  # then the instruction alone tells the task
+        settings = replace(settings, instruction_dropout=0.0, task_dropout=0.0)
+    return common.with_flags(settings, args)
+
+
+def fit_to_recordings(
+    config: PolicyConfig, recordings: Sequence[Demonstrations], longest: int, fewer_points: bool
+) -> PolicyConfig:
+    """The architecture with the dimensions of the recordings.
+
+    Args:
+        config: the architecture otherwise.
+        recordings: one of each task.
+        longest: frames of a demonstration that there are positions for, at least.
+        fewer_points: whether a policy may see fewer points than `config` says, if they have fewer.
+    """
+    first, num_points = recordings[0], config.num_points
+    if fewer_points:
+        num_points = min(num_points, *(d.points.shape[1] for d in recordings))
+    for demonstrations in recordings:
+        ends = [0, *demonstrations.episode_ends.tolist()]
+        longest = max(longest, *np.diff(ends).tolist())
+    return replace(
+        config,
+        point_dim=first.points.shape[2],
+        state_dim=first.state.shape[1],
+        action_dim=first.action.shape[1],
+        num_points=num_points,
+        demo_positions=math.ceil(longest / config.demo_stride),
+    )
+
+
+def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int, int]:
+    """Joins the processes of torchrun, which share the tasks; returns (device, rank, how many).
+
+    Rank 0 collects, logs, saves and evaluates, while the others wait for it.
+    """
+    world = int(os.environ.get("WORLD_SIZE", 1))
+    if world == 1:
+        return device, 0, 1
+    if world > tasks:
+        raise UserError(f"{world} processes for {tasks} tasks: use at most one a task")
+    if "RANK" not in os.environ:
+        raise UserError("WORLD_SIZE is set and RANK is not: start with torchrun, or unset it")
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        torch.cuda.set_device(device)
+    backend = "nccl" if device.type == "cuda" else "gloo"
+    dist.init_process_group(backend, timeout=timedelta(hours=6))  # an evaluation is long
+    return device, int(os.environ["RANK"]), world
+
+
+def check_folder(folder: Path, resume: bool) -> None:
+    """Raises UserError for a run that cannot be resumed, or that a new one would overwrite."""
+    if resume and not (folder / "last.pt").exists():
+        raise UserError(f"there is no run to resume in {folder}: look at --out")
+    if not resume and any(folder.glob("*.pt")):
+        raise UserError(f"{folder} already holds a run: add --resume, or another --out")
+
+
+def begin_log(
+    folder: Path, step: int, settings: Settings, config: PolicyConfig, provenance: dict[str, Any]
+) -> None:
+    """Prints the settings, writes config.json, drops what was logged later than `step`."""
+    default = baselines.PRESETS[config.policy][settings.preset]
+    common.print_settings(
+        used={**asdict(settings), **asdict(config)},
+        default={**asdict(SETTINGS[settings.preset]), **asdict(default)},
+    )
+    content = {**provenance, "arguments": asdict(settings), "config": asdict(config)}
+    write_text(folder / "config.json", json.dumps(content, indent=1))
+
+    path = folder / "metrics.jsonl"
+    kept = [line for line in read_json_lines(path) if 0 < line["step"] <= step]
+    write_text(path, "".join(f"{json.dumps(line)}\n" for line in kept))
+
+
+def make_samplers(
+    recordings: dict[str, Demonstrations], config: PolicyConfig, settings: Settings
+) -> tuple[dict[str, WindowSampler], dict[str, WindowSampler]]:
+    """Task -> the windows to train on, and those of the held-out episodes, if there are any."""
+    train_samplers, heldout_samplers = {}, {}
+    for task, recording in recordings.items():
+        kept, heldout = hold_out(recording, settings.held_out)
+        train_samplers[task] = WindowSampler(
+            kept, config, after_success=settings.after_success, augment=settings.augment
+        )
+        if heldout is not None:
+            heldout_samplers[task] = WindowSampler(heldout, config)
+    return train_samplers, heldout_samplers
 
 
 def run(
     args: argparse.Namespace,
     settings: Settings,
+    config: PolicyConfig,
+    simulator: Simulator | None,
     paths: dict[str, Path],
     folder: Path,
-    facts: dict[str, Any],
+    provenance: dict[str, Any],
     device: torch.device,
     rank: int,
     world: int,
 ) -> None:
-    """Trains on recordings (task -> file), from the start or from where `folder` was left.
+    """Trains on recordings, from the start or from where a run was left; rank 0 writes its files.
 
-    The leader, of rank 0, logs, saves, evaluates and reports.
+    Args:
+        args: the command line.
+        settings: what to train with.
+        config: the architecture, whose dimensions will be those of the recordings.
+        simulator: where to evaluate; None: nowhere.
+        paths: task -> its recording.
+        folder: of the run.
+        provenance: what stands beside every result.
+        device, rank, world: of this process, see `join_processes`.
     """
-    leader = rank == 0
+    # The demonstrations and their windows, which are drawn on the CPU, whatever computes
+    recordings = {
+        task: load_demonstrations(path).take(settings.demonstrations)
+        for task, path in paths.items()
+    }
+    config = fit_to_recordings(
+        config,
+        list(recordings.values()),
+        longest=OWN_FRAMES if simulator is None else simulator.episode_steps,
+        fewer_points=args.num_points is None,
+    )
+    train_samplers, heldout_samplers = make_samplers(recordings, config, settings)
+    data = fingerprint(train_samplers)
 
-    # Demonstrations and their windows, the policy, and the state in which the run was left
-    n, rest = settings.demonstrations, settings.after_success
-    recorded = {task: load_demonstrations(path).take(n) for task, path in paths.items()}
-    config = scripts.choose_config(args, settings.preset, recorded, settings.suite == "own")
-
-    recorded, held = evaluate.hold_out(recorded, settings.held_out)
-    how = (config, "cpu", rest, settings.augment)  # drawn there, whatever computes
-    shown = n and n - settings.held_out  # demonstrations for rollouts
-    samplers, unseen = (scripts.windows(part, *how) for part in (recorded, held))
-    policy, ema, optimizer = initialize(config, settings, samplers, device)
-    data = scripts.digest(samplers)
-    left = {"step": 0, "seconds": 0.0, "text_weights": None}
+    # The policy, fresh or as it was left
+    state, text_weights = start_training(config, settings, train_samplers, device), None
     if args.resume:
-        left = scripts.restore(folder / "last.pt", policy, ema, optimizer, settings, data)
-    start, seconds = left["step"], left["seconds"]
-    how = args.clip_weights, left["text_weights"], device
-    text, identity = scripts.instruction_features(recorded, *how)
+        saved = restore(folder / "last.pt", state, settings, data)
+        text_weights, provenance = saved["text_weights"], saved["provenance"]
+    text, text_weights = evaluate.instruction_features(
+        {task: recording.instruction for task, recording in recordings.items()},
+        weights=args.clip_weights,
+        identity=text_weights,
+        device=device,
+    )
+    provenance = {"text weights": text_weights, **provenance}
 
-    # What is written beside the weights, and beside the results
-    about = {"suite": settings.suite, "preset": settings.preset, "text_weights": identity}
-    about["arguments"] = asdict(settings)
-    facts = {"text weights": identity, **facts}
-    if leader:
-        scripts.begin_run(folder, start, settings, SETTINGS[settings.preset], config, facts)
+    # What every checkpoint says, what last.pt says besides, and where results are measured
+    checkpoint_info = {
+        "suite": settings.suite,
+        "preset": settings.preset,
+        "arguments": asdict(settings),
+        "text_weights": text_weights,
+        "provenance": provenance,
+    }
+    saver = Saver(folder / "last.pt", info={**checkpoint_info, "recordings": data})
+    evaluation = Evaluation(
+        folder=folder,
+        settings=settings,
+        simulator=simulator,
+        recordings=paths,
+        text=text,
+        workers=args.workers,
+        device=device,
+    )
+    if rank == 0:
+        begin_log(folder, state.step, settings, config, provenance)
 
-    bar = {"desc": "training", "unit": "step", "total": settings.steps, "initial": start}
-    with scripts.StopRequest() as stop, progress_bar(**bar, disable=not leader) as progress:
-        how = settings, stop, paths, text, args.workers, device, shown
-        if leader:
-            evaluate.evaluate_step(folder, start, *how)  # the run may have been stopped meanwhile
-        began = saved = time.monotonic()
-        training = meta_train(policy, ema, optimizer, samplers, text, settings, start, rank, world)
-        for step, figures in training:
-            seconds += time.monotonic() - began
-            if leader:
-                progress.update()
-                progress.set_postfix(loss=f"{figures['loss']:.4f}")
-                figures["lr"] = optimizer.param_groups[0]["lr"]
-                scripts.log(folder, step=step, **figures, seconds=round(seconds, 2))
-
-                every = settings.checkpoint_every, settings.evaluate_every
-                milestone = step == settings.steps or any(step % n == 0 for n in every)
+    bar = common.progress_bar(
+        desc="training", unit="step", total=settings.steps, initial=state.step, disable=rank != 0
+    )
+    successes = None
+    with StopRequest() as stop, bar:
+        if rank == 0:
+            successes = evaluation.run(state.step, stop)  # in which a run may have been stopped
+        began = time.monotonic()
+        for figures in meta_train(state, train_samplers, text, settings, rank=rank, world=world):
+            state.seconds += time.monotonic() - began
+            if rank == 0:
+                bar.update()
+                bar.set_postfix(loss=f"{figures['loss']:.4f}")
+                append_json(
+                    folder / "metrics.jsonl",
+                    step=state.step,
+                    **figures,
+                    seconds=round(state.seconds, 2),
+                )
+                milestone = is_milestone(state.step, settings)
                 if milestone:  # before last.pt: a run that goes on from there lacks none of it
-                    checkpoint = folder / f"ema-{step:05d}.pt"
-                    save_checkpoint(checkpoint, ema.module, **about, step=step, seconds=seconds)
-                    evaluate.judge(folder, step, ema.module, samplers, unseen, text)
-                    report.draw_curves(folder)
-                if milestone or stop.requested or time.monotonic() - saved > SAVE_SECONDS:
-                    now = {"step": step, "seconds": seconds, "data": data}
-                    scripts.save_run(folder, policy, ema, optimizer, **about, **now)
-                    saved = time.monotonic()
-
-            if stop.requested and step < settings.steps:
-                raise KeyboardInterrupt(f"saved after step {step}, add --resume to go on")
-            if leader:
-                evaluate.evaluate_step(folder, step, *how)
+                    save_average(folder, state, checkpoint_info)
+                    if heldout_samplers:
+                        log_heldout_errors(folder, state, train_samplers, heldout_samplers, text)
+                    report.plot_curves(folder)
+                if milestone or stop.requested or saver.is_due():
+                    saver.save(state)
+            if stop.requested:
+                raise KeyboardInterrupt(f"saved after step {state.step}, add --resume to go on")
+            if rank == 0:
+                successes = evaluation.run(state.step, stop)
             began = time.monotonic()
+    if rank == 0:
+        report_training(folder, settings, config.policy, state.seconds, provenance, successes)
 
-    if leader:
-        successes = evaluate.evaluate_step(folder, settings.steps, *how)
-        facts |= {"seed": evaluate.EVALUATION_SEED}
-        report.report_training(folder, settings, config.policy, seconds, facts, successes)
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(argv)
+    device = common.pick_device(args.device, args.threads)
+    default = "paper" if device.type == "cuda" else "small"
+    preset = choose(args.preset or default, SETTINGS, "preset")
+    config = choose_architecture(args, preset)
+
+    # Own recordings, or the base tasks of a suite
+    if args.data and not args.suite:
+        suite, simulator = "own", None
+        paths = own_recordings(Path(args.data))
+    else:
+        suite = args.suite or "ml10"
+        simulator = simulator_of(suite)
+        base_tasks, _ = simulator.tasks(suite)
+        paths = {task: Path(args.data or "data") / f"{task}.npz" for task in base_tasks}
+    settings = choose_settings(args, preset, suite, config)
+    name = preset if config.policy == "dami" else f"{config.policy}-{preset}"
+    folder = Path(args.out or f"runs/{suite}-{name}-seed{settings.seed}")
+
+    device, rank, world = join_processes(device, tasks=len(paths))
+    with common.locked(folder) if rank == 0 else nullcontext():
+        if rank == 0:
+            where = f"{device} ({common.hardware(device)})"
+            print(f"preset {name} on {where}, {len(paths)} tasks, in {folder}", flush=True)
+            check_folder(folder, args.resume)
+            if simulator is not None:
+                collect(
+                    simulator,
+                    list(paths),
+                    Path(args.data or "data"),
+                    episodes=settings.demonstrations,
+                    workers=args.workers,
+                )
+        if world > 1:
+            dist.barrier()
+        run(
+            args=args,
+            settings=settings,
+            config=config,
+            simulator=simulator,
+            paths=paths,
+            folder=folder,
+            provenance=common.provenance("train.py", argv, device),
+            device=device,
+            rank=rank,
+            world=world,
+        )
+        if world > 1:
+            dist.destroy_process_group()
 
 
 if __name__ == "__main__":
-    command_line(main)
+    common.command_line(main, errors=(RecordingError, CheckpointError, TextWeightsError))

@@ -21,6 +21,7 @@ import evaluate
 import metaworld_env
 import model
 import train
+from clip import TextWeightsError
 from data import RecordingError
 from model import CheckpointError
 from robot import RobotError
@@ -103,7 +104,7 @@ def run(recorded, tmp_path_factory):
 def fails(script, argv, capsys):
     """Runs a script that must end with exit code 2 and one line on stderr; returns the line."""
     capsys.readouterr()
-    errors = (RecordingError, CheckpointError, RobotError)
+    errors = (RecordingError, CheckpointError, TextWeightsError, RobotError)
     with pytest.raises(SystemExit) as end:
         common.command_line(lambda: script.main([str(arg) for arg in argv]), errors=errors)
     error = capsys.readouterr().err.split("\r")[-1]  # after a progress bar

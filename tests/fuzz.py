@@ -23,7 +23,6 @@ import torch
 
 import data
 import model
-import scripts
 
 ROOT = Path(__file__).parents[1]
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -68,7 +67,7 @@ def same(a: object, b: object) -> bool:
 
 
 def read_checkpoint(path: Path) -> object:
-    policy, info = scripts.load_checkpoint(path)
+    policy, info = model.load(path)
     return dict(policy.state_dict()), info
 
 
@@ -179,7 +178,7 @@ def main(argv: list[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder, recordings = Path(name), Path(args.data).resolve()
         policy = model.DAMIPolicy(model.PRESETS["tiny"])
-        scripts.save_checkpoint(folder / "policy.pt", policy, step=1)
+        model.save(folder / "policy.pt", policy, step=1)
         small = data.load_demonstrations(recordings / "reach.npz").take(1)
         data.save_demonstrations(folder / "reach.npz", small)
         for path, read in (("policy.pt", read_checkpoint), ("reach.npz", read_recording)):

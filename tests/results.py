@@ -31,14 +31,17 @@ from report import (
     pooled_success,
     wilson_interval,
 )
-from scripts import format_table, load_checkpoint, save_checkpoint
-from simulator import suite_tasks
+from common import format_table
+from simulator import simulator_of
 from tests.runs import AGAIN, REPORTS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "RESULTS.json"
 PAPER = json.loads((ROOT / "assets" / "paper_results.json").read_text())
-TASKS = {suite: dict(zip(("base", "novel"), suite_tasks(suite))) for suite in ("ml10", "ml45")}
+TASKS = {
+    suite: dict(zip(("base", "novel"), simulator_of(suite).tasks(suite)))
+    for suite in ("ml10", "ml45")
+}
 DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022); the others are easy
     "medium": "basketball bin-picking box-close coffee-pull coffee-push hammer peg-insert-side "
     "push-wall soccer sweep sweep-into",

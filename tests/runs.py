@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from scripts import choose, command_line
+from common import choose, command_line
 from tests.oracle import WORLDS
 
 VARIANTS = {

@@ -4,6 +4,7 @@ import math
 import re
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 import scipy.fft
@@ -16,7 +17,6 @@ import data
 import evaluate
 import finetune
 import model
-import scripts
 import simulator
 import train
 from baselines import PRESETS, FlowPolicy, FreqPolicy, Mamba, MambaPolicy, associative_scan
@@ -91,13 +91,13 @@ def test_flow_weighs_velocities_only_away_from_the_end_of_a_segment():
 def test_flow_draws_in_one_step_from_the_first_time():
     policy = new_policy("flow")
     batch, seen = random_batch(policy), []
-    policy.unet.register_forward_hook(lambda _, args, out: seen.append((args[0], out)))
-    conditions, condition = [], policy.unet.condition
-    policy.unet.condition = lambda k, x: (conditions.append(k), condition(k, x))[1]
+    policy.denoiser.register_forward_hook(lambda _, args, out: seen.append((args[0], out)))
+    times = []
+    policy.condition_encoder.register_forward_pre_hook(lambda _, args: times.append(args[0]))
     drawn = sample(policy, batch)
     ((noise, velocity),) = seen
     torch.testing.assert_close(drawn, (noise + velocity)[:, 1:4])
-    torch.testing.assert_close(conditions[0], torch.full((6,), 0.99))
+    torch.testing.assert_close(times, [torch.full((6,), 0.99)])
     times = policy.draw_noise_and_timesteps(1000, torch.Generator().manual_seed(0))["times"]
     assert 0.01 <= times.min() < 0.015 and 0.99 < times.max() < 1
 
@@ -152,7 +152,7 @@ def test_mamba_sees_no_later_place():
 
 def test_mambas_branches_are_dropped_by_the_batch_and_never_when_it_draws():
     policy = new_policy("mamba")
-    assert isinstance(policy, MambaPolicy) and policy.unet.branches == 4 * 8
+    assert isinstance(policy, MambaPolicy) and policy.denoiser.branches == 4 * 8
     batch = random_batch(policy, 500)
     factors = batch["drop_path"]
     assert factors.shape == (500, 32) and set(factors.unique().tolist()) == {0, 1.25}
@@ -166,8 +166,11 @@ def test_mambas_branches_are_dropped_by_the_batch_and_never_when_it_draws():
     assert len(losses) == 33  # each branch counts
     observation = policy.encode_observations(few["points"], few["state"]).flatten(1)
     clean = policy.denoise(few["action"], few["timesteps"], observation, None)
-    h = torch.cat([policy.unet.condition(few["timesteps"], observation), torch.ones(2, 32)], dim=1)
-    torch.testing.assert_close(clean, policy.unet(few["action"], h))
+    h = policy.condition_encoder(few["timesteps"], observation)
+    nothing_dropped = policy.denoiser(few["action"], h, drop_path=torch.ones(2, 32))
+    torch.testing.assert_close(clean, nothing_dropped)
+    with pytest.raises(ValueError, match=r"drop_path is \(2, 31\), the policy takes \(2, 32\)"):
+        policy.loss(**few | {"drop_path": torch.ones(2, 31)})
 
 
 # ---- FreqPolicy ----------------------------------------------------------------------------------
@@ -177,18 +180,18 @@ def test_the_cosine_transform_is_scipys_and_a_low_pass_keeps_the_first_frequenci
     policy = new_policy("freq")
     actions, cutoffs = torch.randn(18, 16, 4), torch.arange(18).clamp(max=16)
     spectrum = scipy.fft.dct(actions.numpy(), axis=1, norm="ortho")
-    torch.testing.assert_close(policy.unet.dct @ actions, torch.from_numpy(spectrum))
+    torch.testing.assert_close(policy.denoiser.dct @ actions, torch.from_numpy(spectrum))
     for row, cutoff in zip(spectrum, cutoffs):
         row[cutoff:] = 0
     expected = torch.from_numpy(scipy.fft.idct(spectrum, axis=1, norm="ortho"))
-    torch.testing.assert_close(policy.unet.low_pass(actions, cutoffs), expected)
+    torch.testing.assert_close(policy.denoiser.low_pass(actions, cutoffs), expected)
 
 
 def test_hidden_places_do_not_reach_the_transformer_and_shown_ones_do():
     policy = new_policy("freq")
     batch = random_batch(policy)
     observation = policy.encode_observations(batch["points"], batch["state"])
-    read = lambda low: policy.unet(observation, low, batch["mask"], batch["cutoffs"])  # noqa: E731
+    read = lambda low: policy.denoiser(observation, low, batch["mask"], batch["cutoffs"])  # noqa: E731
     hidden, z = batch["mask"][..., None], read(batch["action"])
     torch.testing.assert_close(read(torch.where(hidden, 7.0, batch["action"])), z)
     shown = ~batch["mask"].all(dim=1)
@@ -215,9 +218,11 @@ def test_freq_draws_cutoffs_of_all_kinds_and_hides_most_places():
 
 def test_freq_draws_in_four_rounds_of_rising_cutoff_and_shrinking_mask():
     policy, rounds = new_policy("freq"), []
-    policy.unet.register_forward_pre_hook(lambda _, args: rounds.append(args[1:]))
+    policy.denoiser.register_forward_pre_hook(lambda _, args: rounds.append(args[1:]))
     steps = []
-    policy.unet.head.register_forward_pre_hook(lambda _, args: steps.append(args[1][0, 0].item()))
+    policy.denoiser.head.register_forward_pre_hook(
+        lambda _, args: steps.append(args[1][0, 0].item())
+    )
     drawn = sample(policy, random_batch(policy))
     assert drawn.shape == (6, 8, 4) and drawn.abs().max() <= 1
     assert [cutoffs.unique().tolist() for _, _, cutoffs in rounds] == [[0], [5], [10], [16]]
@@ -230,7 +235,7 @@ def test_freq_draws_in_four_rounds_of_rising_cutoff_and_shrinking_mask():
 def test_freq_recovers_actions_from_the_right_noise():
     policy = new_policy("freq")
     clean = 0.9 * torch.randn(6, 16, 4).clamp(-1, 1)
-    policy.unet.head.forward = lambda x, k, *_: (
+    policy.denoiser.head.forward = lambda x, k, *_: (
         (x - (a := policy.schedule.alphas_cumprod[k][..., None]).sqrt() * clean) / (1 - a).sqrt()
     )
     drawn = sample(policy, random_batch(policy))
@@ -252,7 +257,7 @@ def test_every_parameter_is_adapted_and_has_a_gradient_and_a_loss_is_pure(name, 
     assert [n for n, p in policy.named_parameters() if p.grad is None] == []
     assert torch.equal(loss, policy(**batch)) and policy.encode_demo(torch.zeros(1, 512)) is None
     for key in policy.draw_noise_and_timesteps(2, torch.Generator()):
-        assert key in train.PER_WINDOW and len(batch[key]) == 6
+        assert key not in model.TASK_INPUTS and len(batch[key]) == 6
         with pytest.raises(ValueError, match=key):
             policy.loss(**batch | {key: batch[key][:1]})  # would broadcast
     with pytest.raises(TypeError):
@@ -297,7 +302,7 @@ def test_the_meta_gradient_equals_finite_differences_one_by_one_and_vectorized(n
             p += 0.05 * torch.randn_like(p)
     params = dict(policy.named_parameters())
     batches = [random_batch(policy, 5, seed, torch.float64) for seed in range(2)]
-    tasks = [train.split(batch, 2) for batch in batches]
+    tasks = [model.split(batch, 2) for batch in batches]
     loss = lambda params, batch: functional_call(policy, params, (), batch)  # noqa: E731
 
     def flat(**options):
@@ -334,33 +339,33 @@ def test_the_meta_gradient_equals_finite_differences_one_by_one_and_vectorized(n
 def test_a_checkpoint_gives_back_the_policy_of_its_name(name, tmp_path):
     policy = new_policy(name)
     batch = random_batch(policy)
-    policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
-    scripts.save_checkpoint(tmp_path / "a.pt", policy)
-    again, _ = scripts.load_checkpoint(tmp_path / "a.pt")
+    policy.normalizer.fit([SimpleNamespace(**batch)])
+    model.save(tmp_path / "a.pt", policy)
+    again, _ = model.load(tmp_path / "a.pt")
     assert type(again) is baselines.POLICIES[name] and again.config == policy.config
     assert torch.equal(sample(again, batch), sample(policy, batch))
 
 
 def test_an_unknown_or_contradictory_policy_is_refused_in_one_line(tmp_path):
-    scripts.save_checkpoint(tmp_path / "a.pt", new_policy("flow"))
+    model.save(tmp_path / "a.pt", new_policy("flow"))
     info = torch.load(tmp_path / "a.pt", weights_only=True)
     for config, message in (
         ({"policy": "fast"}, "policy is 'fast'; use one of dami, dp3, flow, mamba, freq"),
         ({"demo_encoder": "vmt"}, "flow reads no task"),
-        ({"sampler": "dp3"}, "flow has a sampler of its own"),
-        ({"policy": "freq"}, "freq takes two widths|do not fit"),
+        ({"sampler": "dp3"}, "flow needs sampler ddim, not dp3"),
+        ({"policy": "freq"}, "freq needs denoiser frequency-transformer, not unet"),
+        ({"denoiser": "frequency-transformer"}, "is the denoiser of freq, not flow"),
     ):
         torch.save(info | {"config": info["config"] | config}, tmp_path / "b.pt")
         with pytest.raises(ValueError, match=message) as error:
-            scripts.load_checkpoint(tmp_path / "b.pt")
+            model.load(tmp_path / "b.pt")
         assert "\n" not in str(error.value) and "b.pt" in str(error.value)
 
 
 def test_dp3s_sampler_puts_back_the_prediction_and_another_can_be_chosen_at_a_checkpoint(tmp_path):
-    scripts.save_checkpoint(tmp_path / "a.pt", new_policy("dp3"))
+    model.save(tmp_path / "a.pt", new_policy("dp3"))
     (dp3, _), (plain, _) = (
-        scripts.load_checkpoint(tmp_path / "a.pt", **changed)
-        for changed in ({}, {"sampler": "ddim"})
+        model.load(tmp_path / "a.pt", **changed) for changed in ({}, {"sampler": "ddim"})
     )
     assert (plain.config.sampler, dp3.config.sampler) == ("ddim", "dp3")
     batch = random_batch(plain)
@@ -383,7 +388,9 @@ def test_presets_are_of_one_size_and_the_table_counts_them(monkeypatch, capsys):
         small = baselines.build_policy(PRESETS[policy]["tiny"])
         assert re.sub(",", "", counts[2]) == str(sum(p.numel() for p in small.parameters()))
     assert isinstance(new_policy("freq"), FreqPolicy) and isinstance(new_policy("flow"), FlowPolicy)
-    assert not list(new_policy("dp3").unet.condition_mlp.parameters())  # Eq. 7's MLP is DAMI's
+    assert not list(
+        new_policy("dp3").condition_encoder.condition_mlp.parameters()
+    )  # Eq. 7's MLP is DAMI's
 
 
 # ---- Whole runs ----------------------------------------------------------------------------------
@@ -410,7 +417,7 @@ def test_a_policy_is_trained_resumed_adapted_and_rolled_out(
     adapt = ["--task", "door-close", "--checkpoint", "run", "--data", str(recorded), "--out", "new"]
     adapt += "--steps 2 --demonstrations 2 --episodes 0 --clip-weights random --device cpu".split()
     finetune.main(adapt)
-    policy, info = scripts.load_checkpoint("new/adapted.pt")
+    policy, info = model.load("new/adapted.pt")
     assert policy.config.policy == name and info["adapted_to"] == "door-close"
 
     demonstrations = data.load_demonstrations(recorded / "door-close.npz")
@@ -427,4 +434,4 @@ def test_a_policy_that_reads_no_task_is_not_given_one(recorded, small_suite, own
     argv = [*FEW, "--data", recorded, "--out", "run", "--policy", "mamba"]
     assert "mamba reads no task" in fails(train, [*argv, "--demo-encoder", "vmt"], capsys)
     argv[-1] = "freq"
-    assert "freq has a sampler of its own" in fails(train, [*argv, "--sampler", "dp3"], capsys)
+    assert "freq needs sampler ddim, not dp3" in fails(train, [*argv, "--sampler", "dp3"], capsys)

@@ -3,6 +3,7 @@
 import copy
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,28 +11,32 @@ import pytest
 import torch
 from conftest import fails, fingerprint, metrics, same_bits, weights
 
+import common
 import data
 import evaluate
 import finetune
 import model
-import scripts
 
 pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
 
 
 def adapting(run, recorded, options="", task="door-close"):
     """The command line that adapts the short run's policy."""
-    common = f"--task {task} --demonstrations 2 --steps 2 --episodes 0 --device cpu {options}"
-    return [*common.split(), "--data", str(recorded), "--checkpoint", str(run / "ema-00006.pt")]
+    flags = f"--task {task} --demonstrations 2 --steps 2 --episodes 0 --device cpu {options}"
+    return [*flags.split(), "--data", str(recorded), "--checkpoint", str(run / "ema-00006.pt")]
 
 
-def own_recording(frames=200, action_dim=4, ends=None, state_dim=9, task="stir"):
-    """A user's recording of random numbers, not checked."""
+COLORS = 3  # numbers of a point beside its position
+
+
+def own_recording(frames=200, action_dim=4, ends=None, state_dim=9, task="stir", features=0):
+    """The fields of a user's recording of random numbers, not checked."""
     rng = np.random.default_rng(0)
+    points = rng.normal(size=(frames, 64, 3))
     return {
         "task": task,
         "instruction": "Stir the soup.",
-        "points": rng.normal(size=(frames, 64, 3)).astype(np.float16),
+        "points": np.pad(points, ((0, 0), (0, 0), (0, features))).astype(np.float16),
         "state": rng.normal(size=(frames, state_dim)).astype(np.float32),
         "action": rng.uniform(-1, 1, size=(frames, action_dim)).astype(np.float32),
         "episode_ends": np.array([frames] if ends is None else ends, dtype=np.int64),
@@ -39,23 +44,40 @@ def own_recording(frames=200, action_dim=4, ends=None, state_dim=9, task="stir")
     }
 
 
+def save_recording(folder, recording):
+    """Writes the fields of `own_recording`, as somebody else's recorder would."""
+    Path(folder).mkdir(exist_ok=True)
+    np.savez(Path(folder) / f"{recording['task']}.npz", **recording)
+
+
+def evaluated(monkeypatch, successes):
+    """Puts `successes(checkpoint)` in the place of rollouts; returns the list of calls to come."""
+    calls = []
+
+    def evaluate_checkpoint(*, checkpoint, recordings, **options):
+        calls.append(options)
+        return {task: successes(checkpoint) for task in recordings}
+
+    monkeypatch.setattr(evaluate, "evaluate_checkpoint", evaluate_checkpoint)
+    return calls
+
+
 # ---- Adaptation ----------------------------------------------------------------------------------
 
 
-def test_finetuning_needs_only_a_task_and_reports_before_and_after(
-    recorded, monkeypatch, tmp_path, capsys
-):
+def test_finetuning_needs_only_a_task_and_reports_before_and_after(recorded, capsys):
     argv = "--task door-close --demonstrations 2 --steps 4 --batch 4 --episodes 1 --device cpu"
-    finetune.main([*argv.split(), "--data", str(recorded)])
+    argv = [*argv.split(), "--data", str(recorded)]
+    finetune.main(argv)
     folder = Path("runs/finetune/door-close-seed0")
     names = "adapted.pt config.json metrics.jsonl success.json success.md success.png"
-    assert sorted(path.name for path in folder.iterdir()) == names.split()
+    assert sorted(p.name for p in folder.iterdir() if p.name != ".lock") == names.split()
     columns = json.loads((folder / "success.json").read_text())["successes"]
     assert list(columns) == ["before", "after"]
     assert all(len(column["door-close"]) == 1 for column in columns.values())
     printed = capsys.readouterr().out
     assert "using the policy that comes with the code" in printed and "adapted to" in printed
-    assert re.search(r"\| before +\| after +\| paper +\|", printed)
+    assert re.search(r"\| before +\| after +\| paper, DAMI +\|", printed)
     assert re.search(r"\| steps +\| 4 +\| 200 +\|", printed)  # the settings
     assert [line["step"] for line in metrics(folder)] == [1, 2, 3, 4]
 
@@ -66,9 +88,9 @@ def test_finetuning_needs_only_a_task_and_reports_before_and_after(
     assert not torch.equal(policy["normalizer.state_scale"], old["normalizer.state_scale"])
     assert evaluate.SHIPPED_CHECKPOINT.stat().st_size < 16 * 2**20
 
-    before, argv = fingerprint(folder), [*argv.split(), "--data", str(recorded)]
+    before = fingerprint(folder)
     message = fails(finetune, argv, capsys)
-    assert "already holds adapted.pt: add --overwrite" in message
+    assert "already holds success.json: add --overwrite" in message
     assert fingerprint(folder) == before
     for wrong in (["--held-out", "2"], ["--checkpoint", str(folder / "adapted.pt")]):
         fails(finetune, [*argv, "--overwrite", *wrong], capsys)
@@ -88,8 +110,9 @@ def test_adaptation_is_repeatable_and_moves_only_what_has_a_learning_rate(run, r
     def moved(new):
         return {name.split(".")[0] for name in old if not torch.equal(old[name], new[name])}
 
-    assert moved(a) == {"observation_encoder", "demo_encoder", "u2t", "unet", "normalizer"}
-    assert moved(frozen) == {"unet"}
+    diffusion = {"condition_encoder", "denoiser"}
+    assert moved(a) == {"observation_encoder", "demo_encoder", "u2t", "normalizer", *diffusion}
+    assert moved(frozen) == diffusion
 
 
 def test_two_steps_of_adaptation_are_two_of_plain_adamw_on_gradients_clipped_to_norm_one():
@@ -99,7 +122,9 @@ def test_two_steps_of_adaptation_are_two_of_plain_adamw_on_gradients_clipped_to_
     recording["action"] *= np.linspace(1, 20, 400)[:, None]  # not normalized: large gradients
     sampler = data.WindowSampler(data.Demonstrations(**recording), policy.config)
     text, rates = torch.randn(512).double(), {"vision": 1e-3, "diffusion": 3e-3, "other": 1e-2}
-    adapting = finetune.adapt_policy(policy, sampler, text, 2, 4, rates, seed=7)
+    adapting = finetune.adapt_policy(
+        policy, sampler, text, steps=2, batch=4, learning_rates=rates, seed=7
+    )
 
     plain, generator = copy.deepcopy(policy), torch.Generator().manual_seed(7)
     parts = plain.parameter_groups()
@@ -126,9 +151,11 @@ def test_the_papers_learning_rates_belong_to_its_meta_training_and_are_scaled_to
     finetune.main([*adapting(run, recorded, "--lr-other 0.25"), "--out", "adapted"])
     info = weights("adapted/adapted.pt")[1]
     assert info["arguments"]["lr"] == 3e-3  # the paper's is 1e-4
-    rates = json.loads(Path("adapted/config.json").read_text())["learning_rates"]
-    assert rates == pytest.approx({"vision": 3e-4, "diffusion": 9e-4, "other": 0.25})
-    assert info["adaptation"]["learning_rates"] == rates
+    written = json.loads(Path("adapted/config.json").read_text())
+    for used in (written, info["adaptation"]):
+        rates = [used[f"lr_{part}"] for part in ("vision", "diffusion", "other")]
+        assert rates == pytest.approx([3e-4, 9e-4, 0.25])
+        assert used["batch"] == 16 and used["demonstrations"] == 2
 
 
 def test_without_its_instruction_a_task_is_adapted_to_and_rolled_out_on_zeros(
@@ -136,152 +163,164 @@ def test_without_its_instruction_a_task_is_adapted_to_and_rolled_out_on_zeros(
 ):
     adapt_policy, read = finetune.adapt_policy, []
 
-    def watched(policy, sampler, text, *others):
+    def watched(policy, sampler, text, **options):
         read.append(text)
-        return adapt_policy(policy, sampler, text, *others)
-
-    def measured(checkpoint, paths, text, *_, **__):
-        read.append(text["door-close"])
-        return {"door-close": [True]}
+        return adapt_policy(policy, sampler, text, **options)
 
     monkeypatch.setattr(finetune, "adapt_policy", watched)
-    monkeypatch.setattr(evaluate, "evaluate", measured)
+    calls = evaluated(monkeypatch, lambda checkpoint: [True])
     finetune.main([*adapting(run, recorded), "--out", "told"])
     finetune.main([*adapting(run, recorded, "--no-instruction --episodes 1"), "--out", "untold"])
     options = "--demonstrations 2 --episodes 1 --checkpoint untold --out measured".split()
     evaluate.main(["--data", str(recorded), *options])
-    told, *untold = read  # the others: adapted with, before, after, and by evaluate.py
-    assert told.any() and len(untold) == 4 and not any(text.any() for text in untold)
+    with_instruction, without = read
+    assert with_instruction.any() and not without.any()
+    assert len(calls) == 3  # before, after, and by evaluate.py
+    assert not any(call["text"]["door-close"].any() for call in calls)
 
 
 def test_all_novel_tasks_are_adapted_to_as_each_alone(run, recorded, monkeypatch):
-    def measured(policy, paths, *_):
-        return {task: [True, policy.stem != "ema-00006"] for task in paths}
-
-    monkeypatch.setattr(evaluate, "evaluate", measured)
+    evaluated(monkeypatch, lambda checkpoint: [True, checkpoint.stem != "ema-00006"])
     options = "--episodes 2 --curve 1"
     finetune.main([*adapting(run, recorded, options, task="novel"), "--out", "all"])
     finetune.main([*adapting(run, recorded), "--out", "alone"])
     adapted, info = weights("all/door-close/adapted.pt")
     assert same_bits(dict(adapted), dict(weights("alone/adapted.pt")[0]))
     assert info["adapted_to"] == "door-close"
-    between = weights("all/door-close/adapted-00001.pt")[0]  # 9 is more than there are
+    between = weights("all/door-close/adapted-00001.pt")[0]
     assert any(not torch.equal(between[name], adapted[name]) for name in adapted)
     columns = json.loads(Path("all/success.json").read_text())["successes"]
     expected = {"before": [True, False], "1 steps": [True, True], "after": [True, True]}
     assert columns == {name: {"door-close": episodes} for name, episodes in expected.items()}
 
 
+def test_several_tasks_stand_side_by_side_in_one_report(run, recorded, monkeypatch):
+    evaluated(monkeypatch, lambda checkpoint: [checkpoint.stem == "adapted"])
+    argv = adapting(run, recorded, "--episodes 1", task="door-close reach")
+    finetune.main([*argv, "--out", "both"])
+    assert {path.parent.name for path in Path("both").rglob("adapted.pt")} == {
+        "door-close",
+        "reach",
+    }
+    report = json.loads(Path("both/success.json").read_text())
+    assert report["successes"]["before"] == {"door-close": [False], "reach": [False]}
+    assert report["successes"]["after"] == {"door-close": [True], "reach": [True]}
+    assert report["provenance"]["title"] == "door-close-reach: before and after 2 steps"
+
+
 def test_rollouts_read_the_demonstrations_that_were_adapted_to(run, recorded, monkeypatch):
-    seen = []
-
-    def evaluate_nothing(*args):
-        seen.append(args[-1])
-        return {"reach": [True]}
-
-    monkeypatch.setattr(evaluate, "evaluate", evaluate_nothing)
-    file = recorded / "reach.npz"
-    argv = [*adapting(run, file, "--episodes 1", task="reach"), "--demonstrations"]
-    finetune.main([*argv, "1"])
-    assert seen == [1, 1]  # before and after
-    finetune.main([*argv, "2", "--held-out", "1", "--overwrite"])
-    assert seen[2:] == [1, 1]
+    calls = evaluated(monkeypatch, lambda checkpoint: [True])
+    argv = adapting(run, recorded / "reach.npz", "--episodes 1", task="reach")
+    finetune.main([*argv, "--demonstrations", "1"])
+    finetune.main([*argv, "--demonstrations", "2", "--held-out", "1", "--overwrite"])
+    assert [call["n_demonstrations"] for call in calls] == [1, 1, 1, 1]  # before, after; twice
 
 
 def test_own_recordings_are_adapted_to_without_a_simulator(run, capsys):
-    np.savez("own.npz", **own_recording(frames=150))
+    save_recording(".", own_recording(frames=150))
     checkpoint = ["--checkpoint", str(run / "ema-00006.pt")]
-    finetune.main(["--data", "own.npz", *checkpoint, "--demonstrations", "1", "--steps", "2"])
+    finetune.main(["--data", "stir.npz", *checkpoint, "--demonstrations", "1", "--steps", "2"])
     folder = Path("runs/finetune/stir-seed0")
     names = ["adapted.pt", "config.json", "metrics.jsonl"]
-    assert sorted(path.name for path in folder.iterdir()) == names
+    assert sorted(path.name for path in folder.iterdir() if path.name != ".lock") == names
     assert "adapted to stir" in capsys.readouterr().out
+
+
+def test_held_out_episodes_tell_what_adaptation_bought(run, capsys):
+    save_recording(".", own_recording(180, ends=[90, 180]))
+    options = ["--checkpoint", str(run), *"--held-out 1 --steps 2 --out adapted".split()]
+    finetune.main(["--data", "stir.npz", *options])
+    before, after = (line for line in metrics(Path("adapted")) if "action_error" in line)
+    assert (before["step"], after["step"]) == (0, 2)
+    assert before["action_errors"] == {"stir": before["action_error"]}
+    printed, table = capsys.readouterr().out, Path("adapted/held-out.md").read_text()
+    head = r"\| held-out action error +\| step 0 +\| step 2 +\| the mean action"
+    assert re.search(head, printed) and re.search(head, table)
+    row = rf"\| stir +\| {before['action_error']:.4f} +\| {after['action_error']:.4f} +\|"
+    assert re.search(row, table)
 
 
 # ---- Bad input -----------------------------------------------------------------------------------
 
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ("", "name a task of Meta-World with --task"),
-        ("--task shelf-plce", "unknown task 'shelf-plce': did you mean 'shelf-place'?"),
-        ("--task shelf-place --steps 0", "--steps is 0: use at least 1"),
-        ("--task shelf-place --lr-other -1", "--lr-other is -1.0: use at least 0"),
-        ("--task shelf-place --checkpoint none.pt", "none.pt"),
-        ("--task novel --suite ml1", "unknown suite 'ml1'"),
-        ("--task shelf-place --curve 5 500", "--curve: use steps from 1 to 199"),
-    ],
-)
-def test_a_wrong_argument_ends_in_one_line_that_says_what_to_do(options, message, capsys):
-    assert message in fails(finetune, options.split(), capsys)
-
-
-@pytest.mark.parametrize(
-    "changes, options, message",
-    [
-        ({"frames": 220}, "", "has 11 frames (every 20th), the policy 10 positions"),
-        ({"action_dim": 7}, "", "has 7 numbers an action, the policy 4: use"),
-        ({"frames": 0, "ends": []}, "", "holds no episodes"),
-        ({}, "--demonstrations 3", "3 demonstrations of stir asked for, there are 1"),
-    ],
-)
-def test_demonstrations_that_do_not_fit_are_refused(run, capsys, changes, options, message):
-    np.savez("own.npz", **own_recording(**changes))
-    argv = ["--data", "own.npz", "--checkpoint", run / "ema-00006.pt", "--steps", "1"]
-    assert message in fails(finetune, [*argv, *options.split()], capsys)
-    assert not list(Path().rglob("adapted.pt"))
+REFUSED = {
+    "": "name a task of a simulator with --task",
+    "--task shelf-plce": "unknown task 'shelf-plce': did you mean 'shelf-place'?",
+    "--task novel --suite ml1": "unknown suite 'ml1'",
+    "--task shelf-place --steps 0": "--steps is 0: use at least 1",
+    "--task shelf-place --lr-other -1": "--lr-other is -1.0: use at least 0",
+    "--task shelf-place --seed 1000": "--seed is 1000: use at most 999",
+    "--task shelf-place --checkpoint none.pt": "none.pt",
+    "--task shelf-place --curve 5 500": "--curve: use steps from 1 to 199",
+    "--data missing.npz": "missing.npz is missing",
+    "--data own.npz --task stir": "no finished run on own",
+    "--data own.npz --task shelf-place": "no finished run on own",
+    "--data own.npz --checkpoint {run} --task reach": "is a recording of stir, not of reach",
+    "--data own.npz --checkpoint {run} --demonstrations 3": "3 demonstrations of stir asked for",
+    "--data own.npz --checkpoint {run} --held-out 2": "has 2 episodes",
+    "--data long.npz --checkpoint {run}": "has 11 frames (every 20th), the policy 10 positions",
+    "--data wide.npz --checkpoint {run}": "has 7 numbers an action, the policy 4: use",
+    "--data none.npz --checkpoint {run}": "holds no episodes",
+    "--data nowhere.npz --checkpoint {run}": "is no name",
+    "--data {recorded}/reach.npz --task drawer-close": "is a recording of reach, not of drawer-",
+    "--data otherwise.npz": "otherwise.npz was recorded with another camera",
+    "--data own.npz --checkpoint {run} --out taken": "taken cannot be written to",
+    "--data own.npz --checkpoint {run} --out {run} --overwrite": "holds a training run",
+}
 
 
-def test_a_recording_of_another_task_is_refused(run, recorded, capsys):
-    argv = adapting(run, recorded / "reach.npz", task="drawer-close")
-    message = fails(finetune, argv, capsys)
-    assert "is a recording of reach, not of drawer-close" in message
+@pytest.fixture
+def files(recorded):
+    """Recordings in the test's folder, most of which do not fit the short run's policy."""
+    recordings = {
+        "own": own_recording(180, ends=[90, 180]),
+        "long": own_recording(220),
+        "wide": own_recording(action_dim=7),
+        "none": own_recording(0, ends=[]),
+        "nowhere": own_recording(task="../../evil"),
+    }
+    for name, recording in recordings.items():
+        np.savez(f"{name}.npz", **recording)
+    reach = data.load_demonstrations(recorded / "reach.npz")
+    reach.meta["camera"] = "another"
+    data.save_demonstrations("otherwise.npz", reach)
+    Path("taken").write_text("a file")
 
 
-@pytest.mark.parametrize("task", ["../../evil", "a/b", "", "x" * 10_000])
-def test_a_name_that_is_no_name_writes_nowhere(run, task, capsys):
-    np.savez("own.npz", **own_recording(task=task))
-    assert "is no name" in fails(finetune, ["--data", "own.npz"], capsys)
-    assert not Path("runs").exists()
+@pytest.mark.parametrize("options", REFUSED)
+def test_a_mistake_ends_in_one_line_that_says_what_to_do(options, files, run, recorded, capsys):
+    argv = options.format(run=run, recorded=recorded).split()
+    before, of_run = fingerprint(Path()), fingerprint(run)
+    assert REFUSED[options] in fails(finetune, [*argv, "--device", "cpu"], capsys)
+    shutil.rmtree("runs", ignore_errors=True)  # an empty folder
+    assert fingerprint(Path()) == before and fingerprint(run) == of_run
 
 
-def test_an_adaptation_that_diverges_stops_and_writes_nothing(run, recorded, capsys):
+def test_an_adaptation_that_diverges_stops_and_writes_no_policy(run, recorded, capsys):
     argv = adapting(run, recorded, "--lr-diffusion 1e30")
     message = fails(finetune, [*argv, "--steps", "20"], capsys)
-    assert "loss not finite at step" in message and "door-close" in message
+    assert "door-close: the loss is not finite at step" in message
     assert not list(Path().rglob("adapted.pt"))
 
 
-def test_neither_a_training_run_nor_a_folder_in_use_is_written_into(run, recorded, capsys):
-    before = fingerprint(run)
-    message = fails(finetune, [*adapting(run, recorded, "--overwrite"), "--out", run], capsys)
-    assert "holds a training run" in message and fingerprint(run) == before
-    with scripts.locked(Path("busy")):
+def test_a_folder_in_use_is_not_written_into(run, recorded, capsys):
+    with common.locked(Path("busy")):
         message = fails(finetune, [*adapting(run, recorded), "--out", "busy"], capsys)
     assert "another process runs in busy" in message
-    Path("busy/.999999999.adapted.pt").write_text("left by a killed process")
-    finetune.main([*adapting(run, recorded), "--out", "busy"])
-    assert not list(Path("busy").glob(".*"))
 
 
-def test_novel_tasks_are_those_of_the_suite_of_the_run(run, recorded, monkeypatch, capsys):
+def test_novel_tasks_are_those_of_the_suite_of_the_run(run, monkeypatch, capsys):
     info = torch.load(run / "ema-00006.pt", weights_only=True)
     torch.save(info | {"suite": "ml45"}, "ml45.pt")
+    torch.save(info | {"suite": "own"}, "own.pt")
 
-    def named(tasks, *_, **__):
-        raise ValueError(f"asked for {' '.join(tasks)}")
+    def named(simulated_in, tasks, *_, **__):
+        raise common.UserError(f"asked for {' '.join(tasks)}")
 
     monkeypatch.setattr(finetune, "collect", named)
-    argv = ["--task", "novel", "--checkpoint", "ml45.pt"]
-    assert "box-close hand-insert" in fails(finetune, argv, capsys)
-    assert "asked for door-close" in fails(finetune, [*argv, "--suite", "ml10"], capsys)
-
-
-def test_a_folder_that_cannot_be_made_ends_in_one_line(run, recorded, capsys):
-    Path("taken").write_text("a file")
-    assert "taken" in fails(finetune, [*adapting(run, recorded), "--out", "taken"], capsys)
-    assert Path("taken").read_text() == "a file"
+    argv = ["--task", "novel", "--checkpoint"]
+    assert "box-close hand-insert" in fails(finetune, [*argv, "ml45.pt"], capsys)
+    assert "asked for door-close" in fails(finetune, [*argv, "ml45.pt", "--suite", "ml10"], capsys)
+    assert "own.pt was trained on own recordings" in fails(finetune, [*argv, "own.pt"], capsys)
 
 
 def test_a_checkpoint_that_does_not_fit_is_refused(run, recorded, capsys):
@@ -289,8 +328,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(run, recorded, capsys):
     torch.save(info | {"config": info["config"] | {"unet_widths": [32, 64]}}, "shape.pt")
     Path("cut.pt").write_bytes((run / "ema-00006.pt").read_bytes()[:1000])
     torch.save(info | {"text_weights": "openai-ViT-B-32-40d36571"}, "clip.pt")
-    policy = model.DAMIPolicy(model.PRESETS["tiny"])
-    scripts.save_checkpoint("bare.pt", policy)
+    model.save("bare.pt", model.DAMIPolicy(model.PRESETS["tiny"]))
     messages = {
         "shape.pt": "weights and configuration do not fit",
         "cut.pt": "damaged",

@@ -11,7 +11,6 @@ from conftest import FEW, same_bits, whole_state
 
 import data
 import model
-import scripts
 import train
 from tests import fuzz
 
@@ -19,7 +18,7 @@ from tests import fuzz
 @pytest.mark.parametrize("kind", ["flip", "cut"])
 def test_no_damage_to_a_checkpoint_goes_unnoticed(tmp_path, kind):
     policy = model.DAMIPolicy(model.PRESETS["tiny"])
-    scripts.save_checkpoint(tmp_path / "policy.pt", policy, step=1)
+    model.save(tmp_path / "policy.pt", policy, step=1)
     refused = fuzz.fuzz_file(tmp_path / "policy.pt", fuzz.read_checkpoint, 200, kind)
     assert refused == 200 if kind == "cut" else refused > 180
 
@@ -34,13 +33,13 @@ def test_no_damage_to_a_recording_goes_unnoticed(recorded, tmp_path, kind):
 
 def test_a_bit_that_makes_a_tensor_a_folder_to_torch_is_noticed(tmp_path):
     path = tmp_path / "policy.pt"
-    scripts.save_checkpoint(path, model.DAMIPolicy(model.PRESETS["tiny"]))
+    model.save(path, model.DAMIPolicy(model.PRESETS["tiny"]))
     content = bytearray(path.read_bytes())
     entry = content.rindex(b"PK\x01\x02")  # the last of the zip's directory
     content[entry + 38] ^= 1 << 4
     path.write_bytes(content)
     with pytest.raises(ValueError, match="damaged"):
-        scripts.load_checkpoint(path)
+        model.load(path)
 
 
 def test_twenty_kills_at_random_times_change_no_bit(run, recorded, small_suite, tmp_path):
@@ -72,7 +71,7 @@ def test_weights_that_are_not_finite_are_not_saved(tmp_path):
     with torch.no_grad():
         policy.unet.head[1].weight[0] = torch.nan
     with pytest.raises(ValueError, match="not finite"):
-        scripts.save_checkpoint(tmp_path / "policy.pt", policy)
+        model.save(tmp_path / "policy.pt", policy)
     assert not list(tmp_path.iterdir())
 
 
@@ -89,11 +88,11 @@ def test_weights_that_are_not_finite_are_not_saved(tmp_path):
 )
 def test_an_edited_configuration_is_refused_before_memory_is_taken(tmp_path, changes):
     path = tmp_path / "policy.pt"
-    scripts.save_checkpoint(path, model.DAMIPolicy(model.PRESETS["tiny"]))
+    model.save(path, model.DAMIPolicy(model.PRESETS["tiny"]))
     content = torch.load(path, weights_only=True)
     torch.save(content | {"config": content["config"] | changes}, path)
     with pytest.raises(ValueError, match="do not fit"):
-        scripts.load_checkpoint(path)
+        model.load(path)
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 from torch.func import functional_call, grad
 from torch.multiprocessing.reductions import StorageWeakRef
+from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -184,6 +186,127 @@ def test_parameters_may_have_one_gradient_between_them(vectorize):
     adapted = [-0.2 + 2 * 0.1 * 2 * (support + 0.2) for support, _ in tasks]
     expected = torch.stack([2 * (x - query) for x, (_, query) in zip(adapted, tasks)]).mean(dim=0)
     torch.testing.assert_close(one, {"a": expected, "b": expected})
+
+
+# ---- Every layer of torch.nn, with and without vmap ----------------------------------------------
+
+
+class Tokens(nn.Module):
+    """Reads whole numbers, made of its input, with a layer of torch.nn."""
+
+    def __init__(self, layer):
+        super().__init__()
+        self.layer = layer
+
+    def forward(self, x):
+        return self.layer((3 * x.abs()).long().clamp(max=9))
+
+
+class SelfAttention(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.attention = nn.MultiheadAttention(8, 2, batch_first=True)
+
+    def forward(self, x):
+        return self.attention(x, x, x)[0]
+
+
+class Twice(nn.Module):
+    def __init__(self, layer):
+        super().__init__()
+        self.layer = layer
+
+    def forward(self, x):
+        return self.layer(x, x.flip(0))
+
+
+SEQUENCE, IMAGE, VOLUME = (4, 6, 8), (2, 4, 5, 5), (2, 4, 4, 4, 4)
+# fmt: off
+LAYERS = [  # what PyTorch gets wrong stands first
+    (lambda: nn.LayerNorm(8), SEQUENCE),
+    (lambda: nn.LayerNorm((6, 8)), SEQUENCE),
+    (lambda: nn.LayerNorm(8, bias=False), SEQUENCE),
+    (lambda: nn.LayerNorm(8, elementwise_affine=False), SEQUENCE),
+    (lambda: nn.BatchNorm1d(6, track_running_stats=False), SEQUENCE),
+    (lambda: nn.BatchNorm1d(8, track_running_stats=False), (4, 8)),
+    (lambda: nn.BatchNorm2d(4, track_running_stats=False), IMAGE),
+    (lambda: nn.BatchNorm1d(6).eval(), SEQUENCE),
+    (lambda: nn.InstanceNorm1d(6, affine=True), SEQUENCE),
+    (lambda: nn.InstanceNorm2d(4, affine=True), IMAGE),
+    (lambda: nn.InstanceNorm3d(4, affine=True), VOLUME),
+    (lambda: nn.InstanceNorm2d(4, affine=True, track_running_stats=True).eval(), IMAGE),
+    (lambda: nn.TransformerEncoderLayer(8, 2, 16, dropout=0, batch_first=True), SEQUENCE),
+    (lambda: Twice(nn.TransformerDecoderLayer(8, 2, 16, dropout=0, batch_first=True)), SEQUENCE),
+    (lambda: nn.GroupNorm(2, 6), SEQUENCE),
+    (lambda: nn.RMSNorm(8), SEQUENCE),
+    (lambda: nn.LocalResponseNorm(2), SEQUENCE),
+    (lambda: nn.utils.parametrizations.weight_norm(nn.Linear(8, 5)), SEQUENCE),
+    (lambda: nn.Linear(8, 5), SEQUENCE),
+    (lambda: Twice(nn.Bilinear(8, 8, 5)), SEQUENCE),
+    (lambda: nn.Conv1d(6, 4, 3, padding=1, padding_mode="reflect"), SEQUENCE),
+    (lambda: nn.Conv2d(4, 6, 3, groups=2, stride=2, padding=1), IMAGE),
+    (lambda: nn.Conv3d(4, 2, 3, dilation=2, padding="same"), VOLUME),
+    (lambda: nn.ConvTranspose1d(6, 4, 4, stride=2, padding=1), SEQUENCE),
+    (lambda: nn.ConvTranspose2d(4, 6, 3, groups=2), IMAGE),
+    (lambda: Tokens(nn.Embedding(10, 8)), SEQUENCE),
+    (SelfAttention, SEQUENCE),
+    (lambda: nn.PReLU(6), SEQUENCE),
+    (nn.GELU, SEQUENCE),
+    (nn.Mish, SEQUENCE),
+    (nn.ELU, SEQUENCE),
+    (nn.GLU, SEQUENCE),
+    (lambda: nn.Softmax(-1), SEQUENCE),
+    (lambda: nn.MaxPool2d(2), IMAGE),
+    (lambda: nn.AvgPool1d(2), SEQUENCE),
+    (lambda: nn.AdaptiveMaxPool2d(2), IMAGE),
+    (lambda: nn.LPPool1d(2, 2), SEQUENCE),
+    (lambda: nn.Upsample(scale_factor=2, mode="bicubic"), IMAGE),
+]
+# fmt: on
+
+
+def both_ways(layer, shape):
+    """The meta-gradient of a loss that reads a layer, one task at a time and two at a time."""
+    torch.manual_seed(0)
+    layer = layer.double()
+    with torch.no_grad():
+        for parameter in layer.parameters():  # a weight that is 1 hides an error
+            parameter += 0.3 * torch.randn_like(parameter)
+    params = {name: p.detach() for name, p in layer.named_parameters()}
+    params["scale"] = torch.randn(shape[1:], dtype=torch.float64)
+    tasks = [tuple(pair) for pair in torch.randn(3, 2, *shape, dtype=torch.float64)]
+
+    def loss(params, x):
+        weights = {name: p for name, p in params.items() if name != "scale"}
+        y = functional_call(layer, weights, (torch.tanh(x * params["scale"]) + 0.3 * x,))
+        return (y**3).mean() + y.sin().mean() + 0.01 * (params["scale"] ** 2).sum()
+
+    with sdpa_kernel(SDPBackend.MATH):  # the only attention that has a second derivative
+        return [meta_gradient(loss, params, tasks, 0.05, 2, vectorize=n)[0] for n in (1, 2)]
+
+
+@pytest.mark.parametrize("make, shape", LAYERS)
+def test_a_layer_of_torch_has_the_same_meta_gradient_with_and_without_vmap(make, shape):
+    one_by_one, vectorized = both_ways(make(), shape)
+    torch.testing.assert_close(vectorized, one_by_one, atol=1e-10, rtol=1e-8)
+
+
+@pytest.mark.parametrize("options", [{"padding_idx": 0}, {"scale_grad_by_freq": True}])
+def test_an_embedding_that_vmap_gets_wrong_is_refused(options):
+    with pytest.raises(NotImplementedError, match=r"derivatives of embedding.*use vectorize=1"):
+        both_ways(Tokens(nn.Embedding(10, 8, **options)), SEQUENCE)
+
+
+def test_a_function_beneath_the_layers_is_refused_as_well():
+    class Direct(nn.Module):
+        def forward(self, x):
+            return torch.layer_norm(x, (8,), x[0, 0])
+
+    with pytest.raises(NotImplementedError, match="derivatives of layer_norm"):
+        both_ways(Direct(), SEQUENCE)
+
+
+# ---- Tasks, one at a time and several at once ----------------------------------------------------
 
 
 def test_without_tasks_there_is_no_meta_gradient():

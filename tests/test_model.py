@@ -1,41 +1,43 @@
 """Tests of model.py against diffusers, a textbook's DP3, and real demonstrations."""
 
 import ast
+import itertools
 import os
+import shutil
+import stat
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from diffusers import DDIMScheduler
 from diffusers.models.embeddings import get_timestep_embedding
 
+import baselines
 import data
 import model
-import scripts
-from baselines import build_policy
 from model import (
     PRESETS,
+    TASK_INPUTS,
+    CheckpointError,
     Conv1d,
+    CriticalPoints,
     DAMIPolicy,
     DiffusionSchedule,
     Normalizer,
     PointNetEncoder,
     PolicyConfig,
-    WinningPoints,
 )
 from tests.textbook import TextbookDP3
 
 TINY = PRESETS["tiny"]
-BATCH = (
-    "points",
-    "state",
-    "action",
-    "noise",
-    "timesteps",
-)  # what a policy reads that knows no task
+TASKLESS = {"demo_encoder": "none", "tcfm": "none"}
 ABLATIONS = [("vmt", "down"), ("vmt", "mid"), ("vmt", "up"), ("mlp", "down"), ("none", "down")]
 ABLATIONS += [("mlp", "none"), ("vmt", "none"), ("none", "none")]
+MORE = [("mlp", "mid"), ("mlp", "up"), ("none", "mid"), ("none", "up")]
 
 
 ROOT = Path(model.__file__).parent
@@ -57,7 +59,7 @@ def imports(path):
 
 def new_policy(seed=0, **changes):
     torch.manual_seed(seed)
-    return build_policy(replace(TINY, **changes)).eval()
+    return model.build_policy(replace(TINY, **changes)).eval()
 
 
 def random_batch(config, windows=6, tasks=1, frames=10, seed=0):
@@ -65,11 +67,11 @@ def random_batch(config, windows=6, tasks=1, frames=10, seed=0):
     g = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.randn(shape, generator=g)  # noqa: E731
     return {
-        "points": draw(windows, config.n_obs_steps, config.num_points, 3),
+        "points": draw(windows, config.n_obs_steps, config.num_points, config.point_dim),
         "state": draw(windows, config.n_obs_steps, config.state_dim),
         "action": draw(windows, config.horizon, config.action_dim),
         "text": draw(tasks, config.text_dim),
-        "demo_points": draw(tasks, frames, config.num_points, 3),
+        "demo_points": draw(tasks, frames, config.num_points, config.point_dim),
         "demo_state": draw(tasks, frames, config.state_dim),
         "demo_action": draw(tasks, frames, config.action_dim),
         "noise": draw(windows, config.horizon, config.action_dim),
@@ -97,14 +99,19 @@ def sample(policy, batch, seed=0):
     "changes, numbers",
     [
         ({"n_action_steps": 16}, ("16", "15", "2")),
-        ({"horizon": 18}, ("18", "4")),
+        ({"horizon": 18}, ("18", "multiple of 4")),
         ({"inference_steps": 7}, ("100", "7")),
         ({"demo_dim": 130}, ("130", "4")),
         ({"u2t_heads": 7}, ("384", "7")),
-        ({"unet_widths": (512, 1020, 2048)}, ("4", "8")),
+        ({"unet_widths": (512, 1020, 2048)}, ("1020", "8")),
         ({"demo_encoder": "lstm"}, ("lstm", "vmt")),
-        ({"timestep_dim": 2}, ("timestep_dim >= 4",)),
-        ({"timestep_dim": 31}, ("timestep_dim", "31", "2")),
+        ({"timestep_dim": 2}, ("timestep_dim", "2", "4")),
+        ({"point_dim": 2}, ("point_dim", "2", "3")),
+        ({"denoiser": "mlp"}, ("mlp", "unet")),
+        ({"unet_widths": ()}, ("unet_widths", "()")),
+        ({"pointnet_widths": (64, 0)}, ("pointnet_widths", "0", "1")),
+        ({"u2t_layers": 100}, ("u2t_layers", "100", "99")),
+        ({"timestep_dim": 31}, ("timestep_dim", "31", "even")),
         ({"tcfm": "left"}, ("left", "mid")),
     ],
 )
@@ -128,7 +135,9 @@ def test_every_parameter_has_one_adaptation_learning_rate_and_a_gradient(demo_en
     grouped = [id(p) for group in groups.values() for p in group]
     assert sorted(grouped) == sorted(id(p) for p in policy.parameters())
     assert set(map(id, policy.observation_encoder.parameters())) == set(map(id, groups["vision"]))
-    assert set(map(id, policy.unet.parameters())) == set(map(id, groups["diffusion"]))
+    assert set(map(id, groups["diffusion"])) == set(
+        map(id, [*policy.condition_encoder.parameters(), *policy.denoiser.parameters()])
+    )
     policy.loss(**random_batch(policy.config)).backward()
     without = [name for name, p in policy.named_parameters() if p.grad is None]
     assert without == []
@@ -199,7 +208,7 @@ def test_sampling_equals_a_full_run_of_diffusers(peer):
 def test_sampled_actions_are_diffusers_run_of_the_denoiser_from_the_newest_observation_on(peer):
     policy = new_policy(sampler="ddim")
     batch = random_batch(policy.config)
-    policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
+    policy.normalizer.fit([SimpleNamespace(**batch)])
     context = context_of(policy, batch)
     observation = policy.encode_observations(batch["points"], batch["state"]).flatten(1)
     actions = torch.randn(6, 16, 4, generator=torch.Generator().manual_seed(0))
@@ -213,9 +222,11 @@ def test_sampled_actions_are_diffusers_run_of_the_denoiser_from_the_newest_obser
 
 def test_the_timestep_embedding_equals_that_of_diffusers():
     policy, seen = new_policy(), []
-    policy.unet.timestep_mlp.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    policy.condition_encoder.timestep_mlp.register_forward_pre_hook(
+        lambda _, args: seen.append(args[0])
+    )
     timesteps = torch.tensor([0, 1, 37, 99])
-    policy.unet.condition(timesteps, torch.zeros(4, 2 * policy.config.observation_feature_dim))
+    policy.condition_encoder(timesteps, torch.zeros(4, 2 * policy.config.observation_feature_dim))
     expected = get_timestep_embedding(timesteps, policy.config.timestep_dim, downscale_freq_shift=1)
     torch.testing.assert_close(seen[0], expected, atol=1e-5, rtol=0)
 
@@ -238,6 +249,17 @@ def test_loss_is_a_pure_function_of_its_arguments():
     assert torch.equal(policy.loss(**batch), policy.loss(**batch))
     for name in ("noise", "timesteps"):
         assert not torch.equal(policy.loss(**batch), policy.loss(**batch | {name: other[name]}))
+
+
+def test_noise_is_standard_normal_and_every_window_has_a_timestep_of_its_own_from_0_to_99():
+    policy = new_policy()
+    drawn = policy.draw_noise_and_timesteps(3000, torch.Generator().manual_seed(0))
+    assert drawn["timesteps"].shape == (3000,) and drawn["timesteps"].dtype == torch.int64
+    counts = drawn["timesteps"].bincount(minlength=100)
+    assert len(counts) == 100 and 10 <= counts.min() and counts.max() <= 60  # 30 of each
+    assert drawn["noise"].shape == (3000, 16, 4)
+    assert drawn["noise"].mean().abs() < 0.01 and (drawn["noise"].std() - 1).abs() < 0.01
+    assert drawn["noise"].std(dim=0).min() > 0.9  # it is not the same for all windows
 
 
 # ---- The task: demonstration and instruction -----------------------------------------------------
@@ -264,6 +286,16 @@ def test_the_shared_key_path_of_u2t_equals_the_full_sequence_with_its_gradients(
     for shared, full in zip(*both):
         assert full.abs().max() > 0
         torch.testing.assert_close(shared, full, atol=1e-6, rtol=0)
+
+
+def test_u2t_with_two_layers_is_read_at_the_place_of_h():
+    u2t = new_policy(u2t_layers=2).u2t
+    h = torch.randn(4, TINY.condition_dim)
+    demo, text = torch.randn(2, 7, TINY.demo_dim), torch.randn(2, TINY.text_dim)
+    tokens = u2t.embed(demo, text).repeat_interleave(2, dim=0)
+    first, second = u2t.blocks
+    expected = second(first(torch.cat([h[:, None], tokens], dim=1)))[:, 0]  # order is no matter
+    torch.testing.assert_close(u2t(h, u2t.encode_context(demo, text)), expected)
 
 
 @pytest.mark.parametrize("layers", [1, 2])
@@ -338,18 +370,19 @@ def test_the_order_of_a_clouds_points_changes_nothing():
     torch.testing.assert_close(sample(policy, shuffled), sample(policy, batch), atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("shape", [(5, 2, 40, 3), (40, 3)])
-def test_only_the_points_that_win_a_channel_are_differentiated_and_none_of_them_is_missing(shape):
+@pytest.mark.parametrize("shape", [(5, 2, 40, 3), (40, 3), (5, 2, 40, 6), (40, 4)])
+def test_only_critical_points_are_differentiated_and_none_of_them_is_missing(shape):
     torch.manual_seed(0)
-    pointnet, points = PointNetEncoder((8, 16), 4), torch.randn(shape)
+    points = torch.randn(shape)
+    pointnet = PointNetEncoder((8, 16), 4, point_dim=shape[-1])
     pointnet(points).sum().backward()
     sparse = [p.grad.clone() for p in pointnet.parameters()]
     every = pointnet.mlp(points)  # (..., N, 16)
     pointnet.zero_grad()
     pointnet.projection(every.amax(dim=-2)).sum().backward()
     torch.testing.assert_close(sparse, [p.grad for p in pointnet.parameters()])
-    clouds = points.view(-1, 40, 3)
-    indices = WinningPoints.apply(clouds, *pointnet.mlp.parameters())  # (clouds, K)
+    clouds = points.view(-1, 40, shape[-1])
+    indices = CriticalPoints.apply(clouds, *pointnet.mlp.parameters())  # (clouds, K)
     winners = [set(row.tolist()) for row in pointnet.mlp(clouds).argmax(dim=-2)]
     assert all(won <= set(row.tolist()) for won, row in zip(winners, indices))
     assert indices.shape[1] == max(map(len, winners)) < 40 // 2
@@ -357,12 +390,11 @@ def test_only_the_points_that_win_a_channel_are_differentiated_and_none_of_them_
 
 def test_the_policy_without_a_demonstration_is_the_textbooks_dp3():
     policy = new_policy(demo_encoder="none", tcfm="none")
-    assert not list(policy.unet.condition_mlp.parameters())  # Eq. 7's MLP is DAMI's
+    assert not list(policy.condition_encoder.condition_mlp.parameters())  # Eq. 7's MLP is DAMI's
     textbook = TextbookDP3(policy.config)
     textbook.load_state_dict(policy.state_dict())
-    batch = {
-        name: x for name, x in random_batch(policy.config, windows=20).items() if name in BATCH
-    }
+    batch = random_batch(policy.config, windows=20)
+    batch = {name: x for name, x in batch.items() if name not in TASK_INPUTS}
     losses = policy.loss(**batch), textbook.loss(**batch)
     torch.testing.assert_close(*losses, rtol=1e-5, atol=0)
     gradients = [
@@ -403,7 +435,7 @@ def test_u2t_conditions_the_two_blocks_of_the_named_level_and_h_all_others(tcfm)
     policy = new_policy(
         tcfm=tcfm, demo_encoder="none" if tcfm == "none" else "vmt", unet_widths=(16, 32, 64)
     )
-    unet = policy.unet
+    unet = policy.denoiser
     levels = {"down": unet.down[0][:2], "mid": unet.mid, "up": unet.up[-1][:2], "none": []}
     h, fused = torch.randn(2, 2, policy.config.condition_dim)
     read = {}
@@ -431,7 +463,7 @@ def test_the_normalizer_maps_the_data_onto_minus_one_to_one_and_back():
     points, state, action = 5 * torch.randn(7, 8, 3) + 2, torch.randn(7, 3), torch.randn(7, 2)
     state[:, 1] = 0.7  # constant
     state[:, 2] = 0.3 + 1e-6 * torch.rand(7)  # as good as constant
-    normalizer.fit(points, state, action)
+    normalizer.fit([SimpleNamespace(points=points, state=state, action=action)])
     for name, x in {"points": points, "state": state, "action": action}.items():
         y = normalizer.normalize(name, x)
         torch.testing.assert_close(normalizer.unnormalize(name, y), x, atol=1e-5, rtol=0)
@@ -446,9 +478,46 @@ def test_the_normalizer_maps_the_data_onto_minus_one_to_one_and_back():
         normalizer.normalize("state", torch.tensor([0.0, 0.9, 0.3]))[1], torch.tensor(0.2)
     )
     action[:, 1] = 0.4
-    normalizer.fit(points, state, action)
+    normalizer.fit([SimpleNamespace(points=points, state=state, action=action)])
     drawn = normalizer.unnormalize("action", torch.tensor([[-1.0, -1.0], [1.0, 1.0]]))
     assert (drawn[:, 1] - 0.4).abs().max() < 1e-4  # what no demonstration moved stays
+
+
+def test_recordings_are_normalized_together_and_colours_never():
+    g = torch.Generator().manual_seed(0)
+    recordings = []
+    for scale in (1.0, 4.0):
+        points = torch.cat([scale * torch.randn(5, 8, 3, generator=g), torch.rand(5, 8, 3)], -1)
+        recordings.append(
+            SimpleNamespace(
+                points=points.half(),
+                state=scale * torch.randn(5, 2, generator=g),
+                action=scale * torch.randn(5, 2, generator=g),
+            )
+        )
+    normalizer = Normalizer(state_dim=2, action_dim=2, point_dim=6)
+    for _ in range(2):  # again, as adaptation does
+        normalizer.fit(iter(recordings))
+    points = torch.cat([r.points for r in recordings]).float()
+    y = normalizer.normalize("points", points)
+    torch.testing.assert_close(y[..., :3].amin((0, 1)), -torch.ones(3))
+    torch.testing.assert_close(y[..., :3].amax((0, 1)), torch.ones(3))
+    assert torch.equal(y[..., 3:], points[..., 3:])
+    actions = normalizer.normalize("action", torch.cat([r.action for r in recordings]))
+    torch.testing.assert_close(actions.amax(0), torch.ones(2))
+
+
+def test_a_policy_with_coloured_points_reads_their_colours(tmp_path):
+    policy = new_policy(point_dim=6)
+    batch = random_batch(policy.config)
+    model.save(tmp_path / "a.pt", policy)
+    policy, _ = model.load(tmp_path / "a.pt")
+    for name in ("points", "demo_points"):
+        other = batch[name].clone()
+        other[..., 3:] = other[..., 3:].flip(0) + 1
+        assert (policy.loss(**batch) - policy.loss(**batch | {name: other})).abs() > 1e-5
+    with pytest.raises(ValueError, match=r"points is \(6, 2, 64, 3\), .* takes \(6, 2, 64, 6\)"):
+        policy.loss(**batch | {"points": batch["points"][..., :3]})
 
 
 def test_every_part_of_a_demonstration_is_normalized_before_it_is_encoded():
@@ -462,7 +531,7 @@ def test_every_part_of_a_demonstration_is_normalized_before_it_is_encoded():
         for part, x in raw.items()
     }
     expected = context_of(policy, batch | by_hand)  # nothing is fitted: as they are
-    policy.normalizer.fit(**raw)
+    policy.normalizer.fit([SimpleNamespace(**raw)])
     found = context_of(policy, batch | {f"demo_{part}": x for part, x in raw.items()})
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
 
@@ -480,10 +549,12 @@ def test_the_moving_average_follows_the_papers_decay():
         expected = decay * expected + (1 - decay) * step
         assert averaged[0, 0].item() == pytest.approx(expected, abs=1e-5)
     ema.n_averaged.fill_(10**6)  # where the cap rules
-    ema.module.get_parameter("unet.head.1.bias").data.zero_()
-    policy.get_parameter("unet.head.1.bias").data.fill_(1.0)
+    ema.module.get_parameter("denoiser.head.1.bias").data.zero_()
+    policy.get_parameter("denoiser.head.1.bias").data.fill_(1.0)
     ema.update_parameters(policy)
-    assert ema.module.get_parameter("unet.head.1.bias")[0].item() == pytest.approx(1e-4, rel=1e-3)
+    assert ema.module.get_parameter("denoiser.head.1.bias")[0].item() == pytest.approx(
+        1e-4, rel=1e-3
+    )
 
 
 # ---- Learning from real Meta-World ---------------------------------------------------------------
@@ -493,7 +564,7 @@ def test_the_policy_overfits_one_real_window_batch_and_samples_its_actions(recor
     policy = new_policy().train()
     demonstrations = data.load_demonstrations(recorded / "reach.npz")
     sampler = data.WindowSampler(demonstrations, policy.config)
-    policy.normalizer.fit(sampler.points, sampler.state, sampler.action)
+    policy.normalizer.fit([sampler])
     generator = torch.Generator().manual_seed(0)
     batch = sampler.batch(8, generator) | {"text": torch.randn(1, 512, generator=generator)}
     optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
@@ -513,17 +584,97 @@ def test_the_policy_overfits_one_real_window_batch_and_samples_its_actions(recor
     assert (drawn - wanted).abs().mean() < 0.25 * spread
 
 
+# ---- What a configuration names ------------------------------------------------------------------
+
+
+def combinations():
+    """Every choice of names that `PolicyConfig` accepts, in a policy smaller than tiny."""
+    small = replace(TINY, num_points=4, pointnet_widths=(8,), unet_widths=(8, 8), text_dim=8)
+    names = model.choices()
+    for values in itertools.product(*names.values()):
+        changes = dict(zip(names, values))
+        yield replace(small, inference_steps=1, **changes)
+
+
+def test_whatever_a_configuration_names_is_built_and_has_a_loss_or_is_refused_in_one_line():
+    built = set()
+    for config in combinations():
+        try:
+            policy = model.build_policy(config)
+        except ValueError as error:
+            assert "\n" not in str(error) and len(str(error)) > 20
+            continue
+        built.add((config.policy, config.denoiser, config.demo_encoder, config.tcfm))
+        g = torch.Generator().manual_seed(0)
+        batch = random_batch(config, windows=2, frames=3)
+        batch = {name: batch[name] for name in ("points", "state", "action", *TASK_INPUTS)}
+        loss = policy.loss(**batch, **policy.draw_noise_and_timesteps(2, g))
+        loss.backward()
+        assert torch.isfinite(loss)
+        unused = [name for name, p in policy.named_parameters() if p.grad is None]
+        assert unused == [], config
+        context = context_of(policy, batch)
+        assert (context is None) == (not policy.reads_task)
+        policy.sample_actions(batch["points"], batch["state"], context, g)
+    dami = {("dami", net, *rest) for net in ("unet", "mamba-unet") for rest in [*ABLATIONS, *MORE]}
+    assert built == dami | {
+        ("dp3", "unet", "none", "none"),
+        ("dp3", "mamba-unet", "none", "none"),
+        ("flow", "unet", "none", "none"),
+        ("flow", "mamba-unet", "none", "none"),
+        ("mamba", "mamba-unet", "none", "none"),
+        ("freq", "frequency-transformer", "none", "none"),
+    }
+
+
+def test_a_policys_class_refuses_the_configuration_of_another():
+    flow = baselines.PRESETS["flow"]["tiny"]
+    with pytest.raises(ValueError, match="policy 'flow' is a FlowPolicy and no DAMIPolicy"):
+        DAMIPolicy(flow)
+    with pytest.raises(ValueError, match="flow reads no task"):
+        model.build_policy(replace(flow, demo_encoder="vmt"))
+    with pytest.raises(ValueError, match="freq needs denoiser frequency-transformer, not unet"):
+        model.build_policy(replace(baselines.PRESETS["freq"]["tiny"], denoiser="unet"))
+
+
+class ToyDenoiser(torch.nn.Module):
+    """A linear map of everything."""
+
+    def __init__(self, config):
+        super().__init__()
+        self.shape = (config.horizon, config.action_dim)
+        size = config.horizon * config.action_dim
+        self.linear = torch.nn.Linear(size + 2 * config.condition_dim, size)
+
+    def forward(self, actions, h, fused=None):
+        fused = h if fused is None else fused
+        x = torch.cat([actions.flatten(1), h, fused], dim=1)
+        return self.linear(x).unflatten(1, self.shape)
+
+
+def test_a_new_network_is_a_class_and_a_line(monkeypatch, tmp_path):
+    monkeypatch.setitem(model.denoisers, "toy", ToyDenoiser)
+    policy = new_policy(denoiser="toy")
+    batch = random_batch(policy.config)
+    model.save(tmp_path / "toy.pt", policy)
+    again, _ = model.load(tmp_path / "toy.pt")
+    assert isinstance(again.denoiser, ToyDenoiser)
+    assert torch.equal(sample(again, batch), sample(policy, batch))
+    diffusion = set(policy.parameter_groups()["diffusion"])
+    assert set(policy.denoiser.parameters()) < diffusion
+
+
 # ---- Checkpoints ---------------------------------------------------------------------------------
 
 
 def test_a_checkpoint_gives_back_policy_normalizer_and_information(tmp_path):
     policy = new_policy(demo_encoder="mlp", tcfm="up")
     batch = random_batch(policy.config)
-    policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
-    scripts.save_checkpoint(
+    policy.normalizer.fit([SimpleNamespace(**batch)])
+    model.save(
         tmp_path / "a.pt", policy, step=7, text_weights="random-seed-0", arguments={"lr": 1e-3}
     )
-    again, info = scripts.load_checkpoint(tmp_path / "a.pt")
+    again, info = model.load(tmp_path / "a.pt")
     assert again.config == policy.config and not again.training
     assert (
         info["step"] == 7
@@ -537,10 +688,10 @@ def test_a_checkpoint_gives_back_policy_normalizer_and_information(tmp_path):
 def test_a_half_precision_checkpoint_is_half_as_large_and_acts_nearly_alike(tmp_path):
     policy = new_policy()
     batch = random_batch(policy.config)
-    policy.normalizer.fit(batch["points"], batch["state"], batch["action"])
+    policy.normalizer.fit([SimpleNamespace(**batch)])
     for name, half in (("whole.pt", False), ("half.pt", True)):
-        scripts.save_checkpoint(tmp_path / name, policy, half=half)
-    again, _ = scripts.load_checkpoint(tmp_path / "half.pt")
+        model.save(tmp_path / name, policy, half=half)
+    again, _ = model.load(tmp_path / "half.pt")
     assert (tmp_path / "half.pt").stat().st_size < 0.6 * (tmp_path / "whole.pt").stat().st_size
     assert all(x.dtype == torch.float32 for x in again.state_dict().values())
     assert all(
@@ -563,7 +714,8 @@ def bad_checkpoints(folder, good):
             (folder / name).write_bytes(content)
     torch.save({"weights": torch.zeros(3)}, folder / "foreign")
     torch.save([1, 2], folder / "list")
-    torch.save({"format": scripts.CHECKPOINT_FORMAT, "model": print}, folder / "pickled")
+    torch.save({"format": "DAMI checkpoint 1", "model": {}}, folder / "old")
+    torch.save({"format": model.FORMAT, "model": print}, folder / "pickled")
     info = torch.load(good, weights_only=True)
     torch.save(info | {"config": info["config"] | {"unet_widths": [32, 64]}}, folder / "shape")
     torch.save(info | {"config": info["config"] | {"flavor": 1}}, folder / "newer")
@@ -574,8 +726,9 @@ def bad_checkpoints(folder, good):
         "empty": "damaged or no PyTorch checkpoint",
         "text": "damaged or no PyTorch checkpoint",
         "pickled": "damaged or no PyTorch checkpoint",
-        "foreign": "is not a file of train.py or finetune.py",
-        "list": "is not a file of train.py or finetune.py",
+        "foreign": "holds no policy",
+        "list": "holds no policy",
+        "old": "written by an older version of this code: train again, or use that version",
         "shape": "do not fit",
         "newer": "flavor",
         "headless": "do not fit",
@@ -583,10 +736,10 @@ def bad_checkpoints(folder, good):
 
 
 def test_a_checkpoint_that_cannot_be_used_is_refused_in_one_line(tmp_path):
-    scripts.save_checkpoint(tmp_path / "good.pt", new_policy())
+    model.save(tmp_path / "good.pt", new_policy())
     for name, message in bad_checkpoints(tmp_path, tmp_path / "good.pt").items():
-        with pytest.raises(ValueError) as error:
-            scripts.load_checkpoint(tmp_path / name)
+        with pytest.raises(CheckpointError) as error:
+            model.load(tmp_path / name)
         assert (
             message in str(error.value)
             and name in str(error.value)
@@ -594,14 +747,60 @@ def test_a_checkpoint_that_cannot_be_used_is_refused_in_one_line(tmp_path):
         ), name
 
 
+def test_a_checkpoint_without_what_a_caller_needs_is_refused_naming_it(tmp_path):
+    model.save(tmp_path / "a.pt", new_policy(), step=1)
+    assert model.load(tmp_path / "a.pt", needs=("step",))[1] == {"step": 1}
+    with pytest.raises(CheckpointError, match=r"a.pt lacks suite, preset: use"):
+        model.load(tmp_path / "a.pt", needs=("suite", "step", "preset"))
+
+
+def test_information_cannot_take_the_place_of_the_weights(tmp_path):
+    with pytest.raises(TypeError, match="model"):
+        model.save(tmp_path / "a.pt", new_policy(), model="tiny")
+
+
+def test_weights_that_float16_cannot_hold_are_not_saved_as_such(tmp_path):
+    policy = new_policy()
+    policy.denoiser.head[1].bias.data.fill_(1e5)
+    model.save(tmp_path / "whole.pt", policy)
+    with pytest.raises(CheckpointError, match=r"half.pt was not written, because weights are not"):
+        model.save(tmp_path / "half.pt", policy, half=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.pt"]
+
+
+def test_saving_removes_nothing_else_and_leaves_a_file_with_usual_permissions(tmp_path):
+    others = [tmp_path / name for name in (f".{os.getpid()}.a.pt", ".a.pt", ".2024.d", "notes.md")]
+    for path in others:
+        path.write_text("mine")
+    model.save(tmp_path / "a.pt", new_policy())
+    assert sorted(tmp_path.iterdir()) == sorted([*others, tmp_path / "a.pt"])
+    assert all(path.read_text() == "mine" for path in others)
+    usual, written = others[0].stat().st_mode, (tmp_path / "a.pt").stat().st_mode
+    assert stat.S_IMODE(written) == stat.S_IMODE(usual)
+
+
+def test_two_that_save_to_one_file_at_the_same_time_do_not_mix_their_bytes(tmp_path, monkeypatch):
+    path, save_file = tmp_path / "a.pt", torch.save
+
+    def interrupted_by_another(content, temporary):
+        monkeypatch.setattr(torch, "save", save_file)
+        model.save(path, new_policy(seed=1), step=1)
+        save_file(content, temporary)
+
+    monkeypatch.setattr(torch, "save", interrupted_by_another)
+    model.save(path, new_policy(), step=2)
+    assert model.load(path)[1] == {"step": 2}
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_a_checkpoint_cannot_run_code(tmp_path):
     class Bomb:
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "ran"),)
 
-    torch.save({"format": scripts.CHECKPOINT_FORMAT, "config": Bomb()}, tmp_path / "bomb.pt")
-    with pytest.raises(ValueError):
-        scripts.load_checkpoint(tmp_path / "bomb.pt")
+    torch.save({"format": model.FORMAT, "config": Bomb()}, tmp_path / "bomb.pt")
+    with pytest.raises(CheckpointError):
+        model.load(tmp_path / "bomb.pt")
     assert not (tmp_path / "ran").exists()
 
 
@@ -611,17 +810,86 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
 def test_a_failing_save_leaves_the_old_checkpoint_and_no_temporary_file(
     tmp_path, monkeypatch, failure
 ):
-    scripts.save_checkpoint(tmp_path / "a.pt", new_policy(), step=1)
+    model.save(tmp_path / "a.pt", new_policy(), step=1)
 
     def half(_, path):
         Path(path).write_bytes(b"half")
         raise failure
 
     monkeypatch.setattr(torch, "save", half)
-    with pytest.raises((OSError, KeyboardInterrupt)):
-        scripts.save_checkpoint(tmp_path / "a.pt", new_policy(seed=1), step=2)
-    assert scripts.load_checkpoint(tmp_path / "a.pt")[1]["step"] == 1
+    with pytest.raises((CheckpointError, KeyboardInterrupt)):
+        model.save(tmp_path / "a.pt", new_policy(seed=1), step=2)
+    assert model.load(tmp_path / "a.pt")[1]["step"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
+
+
+# ---- Copied alone --------------------------------------------------------------------------------
+
+SCRIPT = """
+import numpy as np
+import torch
+from torch.func import functional_call
+import data, maml, model
+
+rng = np.random.default_rng(0)
+config = model.PRESETS["tiny"]
+samplers = []
+for task in ("push", "pull"):
+    points = rng.normal(size=(80, 64, 3)).astype(np.float16)
+    state, action = rng.normal(size=(80, 9)), rng.uniform(-1, 1, size=(80, 4))
+    ends = np.array([40, 80])
+    recording = data.Demonstrations(
+        task, f"{task} it", points, state.astype(np.float32), action.astype(np.float32), ends, {}
+    )
+    samplers.append(
+        data.WindowSampler(recording, config, device="cpu", after_success=None, augment=False)
+    )
+policy = model.build_policy(config)
+policy.normalizer.fit(samplers)
+params, generator = dict(policy.named_parameters()), torch.Generator().manual_seed(0)
+optimizer, average = torch.optim.AdamW(policy.parameters(), lr=1e-3), model.ema_model(policy)
+for step in range(3):
+    tasks = []
+    for sampler in samplers:
+        batch = sampler.batch(12, generator) | policy.draw_noise_and_timesteps(12, generator)
+        tasks.append(model.split(batch | {"text": torch.zeros(1, config.text_dim)}, 4))
+    gradients, after, before = maml.meta_gradient(
+        lambda params, batch: functional_call(policy, params, (), batch), params, tasks, lr=0.01
+    )
+    for name, parameter in params.items():
+        parameter.grad = gradients[name]
+    optimizer.step()
+    average.update_parameters(policy)
+    print(after.mean().item(), before.mean().item())
+model.save("policy.pt", average.module, step=3)
+print(model.load("policy.pt")[1])
+"""
+
+
+def test_three_files_copied_alone_meta_train_a_policy(tmp_path):
+    for name in ("model", "maml", "data"):
+        shutil.copy(ROOT / f"{name}.py", tmp_path)
+    (tmp_path / "script.py").write_text(SCRIPT)
+    command = [sys.executable, "-I", "-c", "import sys; sys.path[0:0] = ['.']; import script"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    *losses, info = done.stdout.splitlines()
+    assert len(losses) == 3 and info == "{'step': 3}"
+    for line in losses:
+        after, before = map(float, line.split())
+        assert 0 < after < before  # the inner step helps
+
+
+def test_a_split_batch_has_all_windows_once_and_its_task_twice():
+    batch = random_batch(TINY, windows=6)
+    support, query = model.split(batch, 2)
+    for name, x in batch.items():
+        if name in TASK_INPUTS:
+            assert support[name] is x and query[name] is x
+        else:
+            assert len(support[name]) == 2
+            assert torch.equal(torch.cat([support[name], query[name]]), x)
+    assert set(TASK_INPUTS) < set(batch)
 
 
 # ---- Reading the demonstration -------------------------------------------------------------------
@@ -703,8 +971,8 @@ def test_a_policy_that_reads_a_task_does_not_act_without_one():
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"kernel_size": 4}, r"kernel_size \+ 1 by 2 \(use an odd one\): 5 by 2"),
-        ({"horizon": 15}, "horizon by 2 for each level of the U-Net but the last: 15 by 2"),
+        ({"kernel_size": 4}, "kernel_size is 4: use an odd one"),
+        ({"horizon": 15}, "horizon 15 is no multiple of 2: it is halved between the 2 levels"),
         ({"horizon": 4}, "n_action_steps 8: horizon 4 has 3 after observation 2"),
     ],
 )

@@ -25,11 +25,12 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 import clip
+import common
 import convert
 import data
 import model
+import report
 import robot
-import scripts
 from robot import RTDE, Gripper, RobotError, Servo, Settings
 from tests.emulator import START_POSE, Emulator, write_scene
 from tests.fuzz_robot import fuzz_robot
@@ -44,6 +45,7 @@ BOXES = {
     "camera_to_base": CAMERA_TO_BASE,
 }
 STILL = np.zeros((8, 7))
+ERRORS = (RobotError, data.RecordingError, model.CheckpointError)
 
 
 @pytest.fixture
@@ -932,7 +934,7 @@ def test_frames_without_depth_are_no_traceback():
 def test_wrong_settings_are_refused_in_one_line(tmp_path, changes, message):
     path = tmp_path / "robot.json"
     path.write_text(json.dumps(BOXES | changes))
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(common.UserError, match=message) as caught:
         robot.load_settings(path)
     assert "\n" not in str(caught.value)
 
@@ -940,10 +942,10 @@ def test_wrong_settings_are_refused_in_one_line(tmp_path, changes, message):
 def test_a_file_that_holds_no_settings_is_refused_in_one_line(tmp_path):
     path = tmp_path / "robot.json"
     path.write_text("{")
-    with pytest.raises(ValueError, match="Expecting property name"):
+    with pytest.raises(common.UserError, match="Expecting property name"):
         robot.load_settings(path)
     path.write_text(json.dumps({name: BOXES[name] for name in BOXES if name != "camera_to_base"}))
-    with pytest.raises(ValueError, match=r"missing 1 required .*camera_to_base"):
+    with pytest.raises(common.UserError, match=r"missing 1 required .*camera_to_base"):
         robot.load_settings(path)
 
 
@@ -977,7 +979,7 @@ def is_held(emulator):
 def ends(argv):
     """The exit code of a command."""
     try:
-        scripts.command_line(lambda: robot.main(argv), robot.RobotError)
+        common.command_line(lambda: robot.main(argv), errors=ERRORS)
     except SystemExit as end:
         return end.code
     return 0
@@ -1052,7 +1054,7 @@ def test_the_picture_shows_the_cloud_and_both_boxes_of_any_data(tmp_path, monkey
         drawn.clear()
         arrays = (flat, np.zeros((1, 7)), np.zeros((1, 7)), np.array([1]))
         seen = data.Demonstrations("x", r"half: $\frac$", *arrays, meta)
-        scripts.draw_demonstration(seen, tmp_path / "x.png")
+        report.plot_demonstration(seen, tmp_path / "x.png")
         lines = np.array([line for line in drawn if np.shape(line) == (3, 2)])
         assert len(lines) == 24  # the edges of two boxes
         assert {*lines[:12, 2].ravel()} == {-0.05, 0.5}
@@ -1142,7 +1144,7 @@ def test_what_cannot_be_recorded_is_refused_before_connecting(cell, capsys, monk
     for task in ("../evil", "", "a b", ".hidden"):
         argv = ["record", *cell, "--task", task, "--instruction", "x"]
         assert ends(argv) == 2 and "--task" in capsys.readouterr().err
-    with scripts.locked(Path("demos")):
+    with common.locked(Path("demos")):
         assert ends(record(cell, 1)) == 2
     assert "another process runs in demos" in capsys.readouterr().err
     assert ends(record(cell, 1)) == 2 and "cannot be reached" in capsys.readouterr().err
@@ -1247,7 +1249,7 @@ def robot_policy(path, **changes):
     policy.normalizer.fit(*(torch.from_numpy(x) for x in (points.astype(np.float32), *arrays[1:3])))
     data.save_demonstrations(Path(path).with_name("demos.npz"), recorded)
     info = {"suite": "own", "preset": "tiny", "arguments": {}, "step": 0}
-    scripts.save_checkpoint(path, policy, text_weights="random-seed-0", **info)
+    model.save(path, policy, text_weights="random-seed-0", **info)
 
 
 @pytest.fixture(scope="module")
@@ -1296,7 +1298,7 @@ def test_running_moves_the_arm_within_its_limits_and_ends_with_a_stop(
     for before, after, action in zip(done, done[1:], log.action):
         if np.linalg.norm(action[:3]) < 0.005:  # not cut short
             np.testing.assert_allclose(after[:3] - before[:3], action[:3], atol=4e-3)
-    policy, _ = scripts.load_checkpoint("policy.pt")
+    policy, _ = model.load("policy.pt")
     assert len(data.WindowSampler(log, policy.config)) > 0
 
 
@@ -1519,8 +1521,8 @@ def test_a_policy_that_does_not_fit_the_robot_is_refused_before_connecting(cell,
     Path("robot.json").write_text(json.dumps(content))
     assert ends(["run", *cell, *RUN]) == 2
     assert "points, the robot (7, 7, 64)" in capsys.readouterr().err
-    policy, info = scripts.load_checkpoint("policy.pt")
-    scripts.save_checkpoint("other.pt", policy, **info, adapted_to="pour-tea")
+    policy, info = model.load("policy.pt")
+    model.save("other.pt", policy, **info, adapted_to="pour-tea")
     Path("robot.json").write_text(json.dumps(content | {"num_points": 128}))
     assert ends(["run", *cell, *RUN, "--checkpoint", "other.pt"]) == 2
     assert "was adapted to pour-tea, demos.npz is of another task" in capsys.readouterr().err

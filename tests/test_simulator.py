@@ -16,7 +16,7 @@ from toy_simulator import ToyEnvironment, ToySimulator
 
 import simulator
 from common import UserError, command_line
-from data import load_demonstrations, save_demonstrations
+from data import RecordingError, load_demonstrations, save_demonstrations
 from metaworld_env import MetaWorld
 from simulator import collect, demonstration_seed, evaluation_seed, made_by_simulator
 
@@ -157,9 +157,10 @@ class HardSimulator(ToySimulator):
 
 
 def test_failed_attempts_are_not_kept_but_counted(tmp_path):
-    path = collect(HardSimulator(), [TASK], tmp_path, episodes=2, workers=1)[TASK]
+    path = collect(HardSimulator(), [TASK], tmp_path, episodes=2, seed=4, workers=1)[TASK]
     recorded = load_demonstrations(path)
-    assert recorded.meta["episode_seeds"] == [1, 3] and len(recorded) == 2
+    assert recorded.meta["episode_seeds"] == [400_001, 400_003] and len(recorded) == 2
+    assert recorded.meta["seed"] == 4
     assert recorded.meta["expert_success_rate"] == 0.5
 
 
@@ -280,6 +281,6 @@ def test_what_the_user_gets_wrong_ends_in_one_line_and_exit_code_2(
     Path("damaged").mkdir()
     Path("damaged/reach.npz").write_text("no recording")
     with pytest.raises(SystemExit) as end:
-        command_line(lambda: simulator.main(argv), errors=(ValueError,))
+        command_line(lambda: simulator.main(argv), errors=(RecordingError,))
     error = capsys.readouterr().err
     assert end.value.code == 2 and message in error and error.count("\n") == 1

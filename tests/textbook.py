@@ -58,50 +58,57 @@ class ResidualBlock(nn.Module):
         return self.conv2(self.conv1(x) * scale + bias) + self.residual(x)
 
 
-class UNet(nn.Module):
+class ConditionEncoder(nn.Module):
     def __init__(self, config):
         super().__init__()
         self.width = width = config.timestep_dim
-        levels = [config.action_dim, *config.unet_widths]
         self.timestep_mlp = nn.Sequential(
             nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width)
         )
+
+    def forward(self, timesteps, observation):
+        half = self.width // 2
+        rates = 10000 ** (-torch.arange(half, device=timesteps.device) / (half - 1))
+        angles = timesteps[:, None] * rates[None]
+        step = self.timestep_mlp(torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1))
+        return torch.cat([step, observation], dim=-1)
+
+
+class UNet(nn.Module):
+    def __init__(self, config):
+        super().__init__()
+        levels = [config.action_dim, *config.unet_widths]
         self.down, self.mid, self.up = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
         for i in range(1, len(levels)):
             inside = i < len(levels) - 1
-            shrink = nn.Conv1d(levels[i], levels[i], 3, 2, 1) if inside else nn.Identity()
+            downsample = nn.Conv1d(levels[i], levels[i], 3, 2, 1) if inside else nn.Identity()
             first, second = (
                 ResidualBlock(levels[i - 1], levels[i], config),
                 ResidualBlock(levels[i], levels[i], config),
             )
-            self.down.append(nn.ModuleList([first, second, shrink]))
+            self.down.append(nn.ModuleList([first, second, downsample]))
         self.mid.extend(ResidualBlock(levels[-1], levels[-1], config) for _ in range(2))
         for i in range(len(levels) - 1, 1, -1):
             first = ResidualBlock(2 * levels[i], levels[i - 1], config)
             second = ResidualBlock(levels[i - 1], levels[i - 1], config)
-            grow = nn.ConvTranspose1d(levels[i - 1], levels[i - 1], 4, 2, 1)
-            self.up.append(nn.ModuleList([first, second, grow]))
+            upsample = nn.ConvTranspose1d(levels[i - 1], levels[i - 1], 4, 2, 1)
+            self.up.append(nn.ModuleList([first, second, upsample]))
         self.head = nn.Sequential(
             conv_block(levels[1], levels[1], config),
             nn.Conv1d(levels[1], config.action_dim, kernel_size=1),
         )
 
-    def forward(self, noisy, timesteps, observation):
-        half = self.width // 2
-        rates = 10000 ** (-torch.arange(half, device=noisy.device) / (half - 1))
-        angles = timesteps[:, None] * rates[None]
-        step = self.timestep_mlp(torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1))
-        condition = torch.cat([step, observation], dim=-1)
+    def forward(self, noisy, condition):
         x, kept = noisy.permute(0, 2, 1), []
-        for first, second, shrink in self.down:
+        for first, second, downsample in self.down:
             x = second(first(x, condition), condition)
             kept.append(x)
-            x = shrink(x)
+            x = downsample(x)
         for block in self.mid:
             x = block(x, condition)
-        for first, second, grow in self.up:
+        for first, second, upsample in self.up:
             x = torch.cat([x, kept.pop()], dim=1)
-            x = grow(second(first(x, condition), condition))
+            x = upsample(second(first(x, condition), condition))
         return self.head(x).permute(0, 2, 1)
 
 
@@ -110,7 +117,8 @@ class TextbookDP3(nn.Module):
         super().__init__()
         self.normalizer = Normalizer(config.state_dim, config.action_dim)
         self.observation_encoder = ObservationEncoder(config)
-        self.unet = UNet(config)
+        self.condition_encoder = ConditionEncoder(config)
+        self.denoiser = UNet(config)
         self.scheduler = DDPMScheduler(config.diffusion_steps, beta_schedule="squaredcos_cap_v2")
 
     def loss(self, points, state, action, noise, timesteps):
@@ -119,7 +127,8 @@ class TextbookDP3(nn.Module):
         action = self.normalizer.normalize("action", action)
         observation = self.observation_encoder(points, state).flatten(1)
         noisy = self.scheduler.add_noise(action, noise, timesteps)
-        return F.mse_loss(self.unet(noisy, timesteps, observation), action)
+        condition = self.condition_encoder(timesteps, observation)
+        return F.mse_loss(self.denoiser(noisy, condition), action)
 
 
 def training_step(
