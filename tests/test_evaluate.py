@@ -495,13 +495,13 @@ def test_the_best_checkpoints_of_a_run_are_averaged(run, recordings, monkeypatch
         return {task: [checkpoint.stem == "ema-00003", True] for task in recordings}
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
-    evaluate.main(command(run, recordings, "--episodes 2 --top 2 --out report"))
+    evaluate.main(command(run, recordings, "--episodes 2 --top 1 --out report"))
     written = report_of("report")
     assert written["provenance"]["mean, last checkpoint"] == "50.0 (one run)"
-    assert written["provenance"]["mean, best 2 checkpoints"] == "75.0 (one run)"
+    assert written["provenance"]["mean, best 1 checkpoints"] == "100.0 (one run)"
     assert list(written["successes"]) == ["toy-tiny-seed0/ema-00006"]
     assert len(written["checkpoints"]) == 2
-    assert "best 2 checkpoints" in capsys.readouterr().out
+    assert "best 1 checkpoints" in capsys.readouterr().out
 
 
 def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordings, monkeypatch):
