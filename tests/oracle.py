@@ -27,6 +27,7 @@ import data
 import simulator
 import train
 from camera import RayCastCamera
+from clip import TextWeightsError
 from common import command_line
 from metaworld_env import (
     ARM_LINKS,
@@ -131,4 +132,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, errors=(data.RecordingError, CheckpointError))
+    command_line(main, errors=(data.RecordingError, CheckpointError, TextWeightsError))
