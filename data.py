@@ -624,8 +624,3 @@ class WindowSampler:
         displacement = (action[..., :3] @ a.mT).clamp(-limit, limit)  # (n, T', 3)
         action = torch.cat([displacement, action[..., 3:]], dim=-1)
         return points, state, action
-
-    draw_episode = sample_episode  # old name, until evaluate.py and robot.py are rewritten
-
-
-draw_affine_maps = sample_affine_maps  # old name, until tests/test_train.py is rewritten

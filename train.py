@@ -556,14 +556,8 @@ def report_training(
 # ---- From the command line to a run --------------------------------------------------------------
 
 OWN_FRAMES = 500  # of a demonstration on a real robot: the paper's positions there
-ARCHITECTURE = {  # fields of PolicyConfig that are flags -> what they may be
-    "policy": tuple(baselines.PRESETS),
-    "demo_encoder": (*model.demo_encoders, "none"),
-    "denoiser": tuple(model.denoisers),
-    "tcfm": ("down", "mid", "up", "none"),
-    "sampler": ("ddim", "dp3"),
-    "num_points": None,  # any number
-}
+# The fields of PolicyConfig that are flags
+ARCHITECTURE = ("policy", "demo_encoder", "denoiser", "tcfm", "sampler", "num_points")
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -581,12 +575,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     common.add_common_flags(group)
 
     group = parser.add_argument_group("architecture (default: the preset's)")
-    for name, choices in ARCHITECTURE.items():
+    choices = {**model.choices(), "policy": tuple(baselines.PRESETS)}
+    for name in ARCHITECTURE:
         values = {preset: getattr(config, name) for preset, config in model.PRESETS.items()}
         group.add_argument(
             common.flag_name(name),
-            type=str if choices else int,
-            choices=choices,
+            type=str if name in choices else int,
+            choices=choices.get(name),
             help="see model.PolicyConfig" + common.describe_presets(values),
         )
     group = parser.add_argument_group("settings (default: the preset's)")
