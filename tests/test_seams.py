@@ -59,18 +59,21 @@ def random_features(instructions, weights, identity):
 
 @pytest.fixture(autouse=True)
 def two_entries(monkeypatch, own_folder):
-    """The simulator's entry, and one for the same with colours. Nothing is drawn, to save time."""
+    """The simulator's entry, and one for the same with colours.
+
+    To save time, nothing is drawn, and recordings are made in this process.
+    """
     monkeypatch.setitem(simulator.SIMULATORS, "toy", ToySimulator)
     monkeypatch.setitem(simulator.SIMULATORS, "colored", partial(ToySimulator, colored=True))
     monkeypatch.setattr(evaluate, "text_features", random_features)
     monkeypatch.setattr(report, "save_png", lambda figure, path, dpi: None)
+    monkeypatch.setattr(simulator, "run_jobs", run_here)
 
 
 @pytest.fixture
 def here(monkeypatch):
-    """Nothing runs in other processes."""
-    for module in (simulator, evaluate):
-        monkeypatch.setattr(module, "run_jobs", run_here)
+    """Rollouts are in this process, too."""
+    monkeypatch.setattr(evaluate, "run_jobs", run_here)
     monkeypatch.setattr(evaluate, "worker_state", {})
 
 
@@ -100,8 +103,8 @@ def test_a_network_is_a_class_and_a_line(here, own_folder, monkeypatch):
     monkeypatch.setitem(model.denoisers, "toy-mlp", ToyMLP)  # the line
 
     call(simulator, "--suite toy --episodes 2")
-    call(train, f"--suite toy --preset tiny --steps 2 --denoiser toy-mlp --out run {QUICK}")
-    policy, _ = model.load("run/ema-00002.pt")
+    call(train, f"--suite toy --preset tiny --steps 1 --denoiser toy-mlp --out run {QUICK}")
+    policy, _ = model.load("run/ema-00001.pt")
     assert isinstance(policy.denoiser, ToyMLP) and policy.config.denoiser == "toy-mlp"
     assert policy.reads_task and policy.reads_demonstration
     assert all("loss_before" in line for line in metrics(own_folder / "run"))  # an inner step each
@@ -110,16 +113,17 @@ def test_a_network_is_a_class_and_a_line(here, own_folder, monkeypatch):
     rates = "--lr-vision 0 --lr-other 0 --lr-diffusion 1e-3"
     adapt = "--suite toy --task touch-blue --demonstrations 2 --steps 2"
     call(finetune, f"--checkpoint run {adapt} --out adapted {rates} {QUICK}")
-    parts = changed("run/ema-00002.pt", "adapted/adapted.pt")
+    parts = changed("run/ema-00001.pt", "adapted/adapted.pt")
     assert parts == {"denoiser", "condition_encoder"}
 
-    call(evaluate, f"--checkpoint run --demonstrations 2 --episodes 2 --out measured {CPU}")
-    assert lengths("measured") == {"run/ema-00002": {"touch-red": 2, "touch-green": 2}}
+    call(evaluate, f"--checkpoint run --demonstrations 2 --episodes 1 --out measured {CPU}")
+    assert lengths("measured") == {"run/ema-00001": {"touch-red": 1, "touch-green": 1}}
 
 
 def test_a_simulator_is_a_file_and_an_entry(own_folder, request):
-    # Other processes, which know the simulator by the name of its file only, record and roll out.
-    call(simulator, "--suite toy --episodes 3 --workers 1")
+    call(simulator, "--suite toy --episodes 3")
+
+    # The process that rolls out knows the simulator by the name of its file.
     learn = "--suite toy --preset tiny --maml off --demonstrations 3"
     call(train, f"{learn} --steps 30 --out run --episodes 1 --workers 1 {CPU}")
     assert lengths("run") == {"last checkpoint": {"touch-red": 1, "touch-green": 1}}
@@ -135,13 +139,14 @@ def test_a_simulator_is_a_file_and_an_entry(own_folder, request):
     measure = f"--demonstrations 3 --episodes 10 {CPU}"
     call(evaluate, f"--checkpoint untrained run --out measured {measure}")
     untrained, trained = (sum(map(sum, of.values())) for of in successes("measured").values())
-    assert untrained <= 10 and trained >= 15  # of 20 balls that none of them has seen
+    assert trained > untrained + 4  # of 20 balls that nothing was trained on: 16 and 7
 
-    adapt = f"--suite toy --task novel --demonstrations 3 --steps 2 --episodes 2 {CPU}"
+    adapt = f"--suite toy --task novel --demonstrations 3 --steps 1 --episodes 1 {CPU}"
     call(finetune, f"--checkpoint run {adapt} --out adapted")
-    assert lengths("adapted") == {"before": {"touch-blue": 2}, "after": {"touch-blue": 2}}
-    call(evaluate, f"--checkpoint adapted/touch-blue --out again {measure}")
-    assert lengths("again") == {"touch-blue/adapted": {"touch-blue": 10}}
+    assert lengths("adapted") == {"before": {"touch-blue": 1}, "after": {"touch-blue": 1}}
+    again = f"--demonstrations 3 --episodes 1 {CPU}"
+    call(evaluate, f"--checkpoint adapted/touch-blue --out again {again}")
+    assert lengths("again") == {"touch-blue/adapted": {"touch-blue": 1}}
 
 
 def test_points_with_colors_need_no_line(here, own_folder):
@@ -149,12 +154,12 @@ def test_points_with_colors_need_no_line(here, own_folder):
     points = load_demonstrations("data/touch-blue.npz").points
     assert points.shape[2] == 6 and (points[..., 3:] == (0, 0, 1)).all()
 
-    call(train, f"--suite colored --preset tiny --maml off --steps 2 --out run {QUICK}")
-    adapt = "--suite colored --task touch-blue --demonstrations 2 --steps 2 --episodes 1"
+    call(train, f"--suite colored --preset tiny --maml off --steps 1 --out run {QUICK}")
+    adapt = "--suite colored --task touch-blue --demonstrations 2 --steps 1 --episodes 1"
     call(finetune, f"--checkpoint run {adapt} --out adapted {CPU}")
     call(evaluate, f"--checkpoint run --demonstrations 2 --episodes 1 --out measured {CPU}")
-    assert lengths("measured") == {"run/ema-00002": {"touch-red": 1, "touch-green": 1}}
-    check_colors("run/ema-00002.pt", "adapted/adapted.pt")
+    assert lengths("measured") == {"run/ema-00001": {"touch-red": 1, "touch-green": 1}}
+    check_colors("run/ema-00001.pt", "adapted/adapted.pt")
 
 
 def test_own_recordings_with_colors_need_no_line(here, own_folder):
@@ -165,9 +170,9 @@ def test_own_recordings_with_colors_need_no_line(here, own_folder):
         folder = "new" if name == "touch-blue" else "mine"
         save_demonstrations(f"{folder}/{name}.npz", own)
 
-    call(train, f"--data mine --preset tiny --steps 2 --augment --out run {QUICK}")
-    call(finetune, f"--data new/touch-blue.npz --checkpoint run --steps 2 --out adapted {QUICK}")
-    check_colors("run/ema-00002.pt", "adapted/adapted.pt")
+    call(train, f"--data mine --preset tiny --steps 1 --augment --out run {QUICK}")
+    call(finetune, f"--data new/touch-blue.npz --checkpoint run --steps 1 --out adapted {QUICK}")
+    check_colors("run/ema-00001.pt", "adapted/adapted.pt")
 
 
 def check_colors(trained, adapted):
