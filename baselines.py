@@ -251,7 +251,8 @@ class MambaResidualBlock(nn.Module):
     def __init__(self, block: ResidualBlock, config: PolicyConfig, index: int):
         super().__init__()
         self.conv1, self.film, self.residual = block.conv1, block.film, block.residual
-        self.condition_dim, self.first_branch = config.condition_dim, index * self.BRANCHES
+        self.condition_dim = config.condition_dim
+        self.first_branch = index * self.BRANCHES
         width = self.conv1[0].out_channels
         self.mamba = MixerBlock(Mamba(width), width)
         self.attention = MixerBlock(Attention(width, self.HEADS), width)

@@ -61,12 +61,11 @@ def clip_vocabulary() -> tuple[dict[int, str], dict[tuple[str, str], int], dict[
     """CLIP's byte -> symbol, pair of symbols -> rank of their merge, symbol -> token id."""
     printable = [b for b in range(256) if 33 <= b <= 126 or 161 <= b <= 172 or b >= 174]
     others = [b for b in range(256) if b not in printable]
-    # GPT-2's printable symbols for bytes: one that is not printable becomes chr(256 + i).
-    symbols = {b: chr(b) for b in printable} | {b: chr(256 + i) for i, b in enumerate(others)}
+    symbols = {b: chr(b) for b in printable}
+    for i, b in enumerate(others):  # GPT-2's printable symbols for the other bytes
+        symbols[b] = chr(256 + i)
     with gzip.open(CLIP_MERGES, "rt", encoding="utf-8") as file:
-        lines = file.read().split("\n")[
-            1:48895
-        ]  # after a head line, the 49152 - 256 - 2 merges that CLIP uses
+        lines = file.read().split("\n")[1:48895]  # a head line; CLIP uses 49152 - 256 - 2 merges
     merges = [tuple(line.split()) for line in lines]
     ranks = {pair: rank for rank, pair in enumerate(merges)}
     vocabulary = [

@@ -104,7 +104,9 @@ def meta_gradient(
                 losses = torch.vmap(query_losses, in_dims=(None, 0, 0))(params, support, query)
         return losses[:, 0].sum(), losses  # (tasks, 2)
 
-    tasks, total, losses = iter(tasks), None, []
+    tasks = iter(tasks)
+    losses = []
+    total = None  # of the gradients of all tasks
     while chunk := list(islice(tasks, vectorize)):
         gradients, (_, of_chunk) = grad_and_value(summed_query_loss, has_aux=True)(params, chunk)
         losses.append(of_chunk.detach())

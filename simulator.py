@@ -271,7 +271,8 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
     env = simulator.make(task, simulator.recipe["num_points"])
     most_attempts = min(ATTEMPTS_PER_EPISODE * episodes, seeds_of_a_task(simulator))
 
-    recorded, episode_seeds, success_frames, attempts = [], [], [], 0
+    recorded, episode_seeds, success_frames = [], [], []  # of each successful episode
+    attempts = 0
     while len(recorded) < episodes:
         if attempts == most_attempts:
             raise UserError(
@@ -314,10 +315,11 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
 def record_episode(env: Environment, seed: int) -> tuple[dict[str, np.ndarray], int] | None:
     """Lets the expert act for one episode.
 
-    Returns its "points" (T, N, 3) float16, "state" (T, S) and "action" (T, A) float32, each of the
+    Returns its "points" (T, N, P) float16, "state" (T, S) and "action" (T, A) float32, each of the
     moment before the step, and the frame of its first success; None if it had none.
     """
-    points, state, actions, success_frame = [], [], [], None
+    points, state, actions = [], [], []  # of each frame
+    success_frame = None
     env.begin(seed)
     truncated = False
     while not truncated:

@@ -650,10 +650,10 @@ def fit_to_recordings(
     """
     first, num_points = recordings[0], config.num_points
     if fewer_points:
-        num_points = min(num_points, *(d.points.shape[1] for d in recordings))
+        num_points = min(num_points, min(d.points.shape[1] for d in recordings))
     for demonstrations in recordings:
         ends = [0, *demonstrations.episode_ends.tolist()]
-        longest = max(longest, *np.diff(ends).tolist())
+        longest = max(longest, max(np.diff(ends).tolist()))
     return replace(
         config,
         point_dim=first.points.shape[2],
@@ -763,7 +763,8 @@ def run(
     data = fingerprint(train_samplers)
 
     # The policy, fresh or as it was left
-    state, text_weights = start_training(config, settings, train_samplers, device), None
+    state = start_training(config, settings, train_samplers, device)
+    text_weights = None  # any
     if args.resume:
         saved = restore(folder / "last.pt", state, settings, data)
         text_weights, provenance = saved["text_weights"], saved["provenance"]
