@@ -395,9 +395,7 @@ def read_json(path: Path, name: str, array: np.ndarray) -> Any:
 
 SHIFT = (0.1, 0.1, 0.05)  # metres along each axis, at most
 TURN = math.radians(10)  # about the vertical, at most
-STRETCH = (
-    0.1  # of the shear and stretch matrix each entry differs at most so much from the identity
-)
+STRETCH = 0.1  # added to each entry of an identity matrix, at most
 
 
 def sample_affine_maps(n: int, center: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
