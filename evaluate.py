@@ -35,7 +35,7 @@ from torch import Tensor
 import baselines  # noqa: F401  (adds its policies to those that can be loaded)
 import common
 import model
-from clip import text_features
+from clip import TextWeightsError, text_features
 from common import UserError, progress_bar, report_progress, run_jobs
 from data import RecordingError, WindowSampler, load_demonstrations, positions, write_atomically
 from model import CheckpointError, DAMIPolicy
@@ -88,7 +88,7 @@ def rollout(
         with torch.no_grad():
             contexts.append(policy.encode_demo(text[None], **demonstration))
 
-    # Of each episode the last To observations, the oldest first; at the beginning it is repeated.
+    # Of each episode the last To observations, the oldest first; at first the only one, To times.
     observations = []
     for environment, seed in zip(environments, seeds):
         environment.begin(seed)
@@ -934,4 +934,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    common.command_line(main, errors=(RecordingError, CheckpointError))
+    common.command_line(main, errors=(RecordingError, CheckpointError, TextWeightsError))

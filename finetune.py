@@ -259,7 +259,8 @@ def adapt_checkpoint(
         learning_rates={part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES},
         seed=settings.seed,
     )
-    seconds, began = 0.0, time.monotonic()
+    seconds = 0.0
+    began = time.monotonic()
     with common.progress_bar(
         desc=f"adapting to {demonstrations.task}", unit="step", total=settings.steps
     ) as bar:
@@ -430,7 +431,8 @@ def adapt_tasks(
             continue
 
         columns = {"before": checkpoint}
-        columns |= {f"{step} steps": checkpoint_after(folder, step) for step in sorted(set(curve))}
+        for step in sorted(set(curve)):
+            columns[f"{step} steps"] = checkpoint_after(folder, step)
         columns["after"] = folder / "adapted.pt"
         kept = len(load_demonstrations(paths[task]).take(settings.demonstrations))
         for column, policy in columns.items():

@@ -104,7 +104,9 @@ def meta_gradient(
                 losses = torch.vmap(query_losses, in_dims=(None, 0, 0))(params, support, query)
         return losses[:, 0].sum(), losses  # (tasks, 2)
 
-    tasks, total, losses = iter(tasks), None, []
+    tasks = iter(tasks)
+    losses = []
+    total = None  # of the gradients of all tasks
     while chunk := list(islice(tasks, vectorize)):
         gradients, (_, of_chunk) = grad_and_value(summed_query_loss, has_aux=True)(params, chunk)
         losses.append(of_chunk.detach())
@@ -138,9 +140,9 @@ REFUSED = {  # what those call themselves, in case a loss calls it directly
 
 
 class RightUnderVmap(TorchFunctionMode):
-    """Inside this context normalization has its right derivatives, and an embedding, or an error.
+    """Inside this context normalization has its right derivatives under `torch.vmap`.
 
-    NotImplementedError is raised where the derivatives would be wrong.
+    Other functions that PyTorch differentiates wrongly there raise NotImplementedError.
     """
 
     def __torch_function__(
@@ -149,28 +151,31 @@ class RightUnderVmap(TorchFunctionMode):
         kwargs = kwargs or {}
         if func in NORMALIZATIONS:
             return normalize_then_scale(func, *args, **kwargs)
-        if func is F.embedding:
-            options = signature(func).bind(*args, **kwargs).arguments
-            refused = options.get("padding_idx") is not None or options.get("scale_grad_by_freq")
-        else:
-            refused = func in REFUSED
-        if refused:
+        if func in REFUSED or (func is F.embedding and alters_gradient(*args, **kwargs)):
             raise NotImplementedError(
-                f"PyTorch's derivatives of {func.__name__}, called like this, are wrong under "
-                "torch.vmap: use vectorize=1, or a layer of torch.nn without padding_idx and "
-                "scale_grad_by_freq"
+                f"{func.__name__}, called like this, has wrong derivatives under torch.vmap, which "
+                "is used where several tasks run at once: use vectorize=1"
             )
         return func(*args, **kwargs)
 
 
 def normalize_then_scale(function: Callable, *args: Any, **kwargs: Any) -> Tensor:
-    """One of `NORMALIZATIONS`, its weight and bias applied outside it: so it has no such error."""
+    """One of `NORMALIZATIONS`, with its weight and bias applied outside PyTorch's function."""
     options = signature(function).bind(*args, **kwargs).arguments
     weight, bias = options.pop("weight", None), options.pop("bias", None)
     x = function(**options)  # layer_norm: (..., *weight.shape); the others: (B, channels, ...)
-    if function is not F.layer_norm:
-        per_channel = (-1, *[1] * (x.dim() - 2))
-        weight = None if weight is None else weight.view(per_channel)  # (channels, 1, ...)
-        bias = None if bias is None else bias.view(per_channel)
-    x = x if weight is None else x * weight
-    return x if bias is None else x + bias
+    if function is F.layer_norm:
+        shape = options["normalized_shape"]
+    else:
+        shape = (-1, *[1] * (x.dim() - 2))  # (channels, 1, ...)
+    if weight is not None:
+        x = x * weight.view(*shape)
+    if bias is not None:
+        x = x + bias.view(*shape)
+    return x
+
+
+def alters_gradient(*args: Any, **kwargs: Any) -> bool:
+    """Whether a call of `F.embedding` has an option that leaves out or scales gradients."""
+    options = signature(F.embedding).bind(*args, **kwargs).arguments
+    return options.get("padding_idx") is not None or bool(options.get("scale_grad_by_freq"))

@@ -60,15 +60,7 @@ from data import (
     write_text,
 )
 from maml import meta_gradient
-from model import (
-    TASK_INPUTS,
-    CheckpointError,
-    ConfigError,
-    DAMIPolicy,
-    PolicyConfig,
-    ema_model,
-    split,
-)
+from model import TASK_INPUTS, CheckpointError, DAMIPolicy, PolicyConfig, ema_model, split
 from report import Successes
 from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
 
@@ -573,6 +565,8 @@ def report_training(
 # ---- From the command line to a run --------------------------------------------------------------
 
 OWN_FRAMES = 500  # of a demonstration on a real robot: the paper's positions there
+# The fields of PolicyConfig that are flags
+ARCHITECTURE = ("policy", "demo_encoder", "denoiser", "tcfm", "sampler", "num_points")
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -590,12 +584,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     common.add_common_flags(group)
 
     group = parser.add_argument_group("architecture (default: the preset's)")
-    for name in ("num_points", *model.choices()):
+    choices = {**model.choices(), "policy": tuple(baselines.PRESETS)}
+    for name in ARCHITECTURE:
         values = {preset: getattr(config, name) for preset, config in model.PRESETS.items()}
         group.add_argument(
             common.flag_name(name),
-            type=int if name == "num_points" else str,
-            choices=model.choices().get(name),
+            type=str if name in choices else int,
+            choices=choices.get(name),
             help="see model.PolicyConfig" + common.describe_presets(values),
         )
     group = parser.add_argument_group("settings (default: the preset's)")
@@ -623,12 +618,12 @@ def own_recordings(folder: Path) -> dict[str, Path]:
 
 def choose_architecture(args: argparse.Namespace, preset: str) -> PolicyConfig:
     """The preset's architecture, with the flags that were given."""
-    flags = {name: getattr(args, name) for name in ("num_points", *model.choices())}
+    flags = {name: getattr(args, name) for name in ARCHITECTURE}
     config = baselines.PRESETS[args.policy or "dami"][preset]
     try:
         config = replace(config, **{name: x for name, x in flags.items() if x is not None})
-        build_empty(config)  # not every policy can have every configuration
-    except ConfigError as error:
+        model.POLICIES[config.policy].check_config(config)
+    except ValueError as error:
         raise UserError(str(error)) from error
     return config
 
@@ -664,10 +659,10 @@ def fit_to_recordings(
     """
     first, num_points = recordings[0], config.num_points
     if fewer_points:
-        num_points = min(num_points, *(d.points.shape[1] for d in recordings))
+        num_points = min(num_points, min(d.points.shape[1] for d in recordings))
     for demonstrations in recordings:
         ends = [0, *demonstrations.episode_ends.tolist()]
-        longest = max(longest, *np.diff(ends).tolist())
+        longest = max(longest, max(np.diff(ends).tolist()))
     return replace(
         config,
         point_dim=first.points.shape[2],
@@ -777,7 +772,8 @@ def run(
     data = fingerprint(train_samplers)
 
     # The policy, fresh or as it was left
-    state, text_weights = start_training(config, settings, train_samplers, device), None
+    state = start_training(config, settings, train_samplers, device)
+    text_weights = None  # any
     if args.resume:
         saved = restore(folder / "last.pt", state, settings, data)
         text_weights, provenance = saved["text_weights"], saved["provenance"]
