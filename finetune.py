@@ -163,10 +163,10 @@ def loss_and_gradients(
 
 
 def resolve(settings: Settings, info: dict[str, Any]) -> Settings:
-    """The settings with numbers where they leave it to the training, which `info` tells.
+    """Fills in what the settings leave open: the windows a step, and the learning rates.
 
-    `info` is what a checkpoint says beside its weights. The paper's learning rates belong to a
-    meta-training at 1e-4; to one at another rate they keep their proportion.
+    Both depend on the training that a checkpoint tells of beside its weights (`info`). The paper's
+    learning rates belong to a meta-training at 1e-4; to another one they are in proportion.
     """
     scale = info["arguments"]["lr"] / PAPER_LEARNING_RATE
     numbers = {"batch": BATCH[info["preset"]]}
@@ -237,7 +237,7 @@ def adapt_checkpoint(
     kept, heldout = hold_out(demonstrations, settings.held_out)
     after_success = info["arguments"]["after_success"]
     sampler = WindowSampler(kept, policy.config, after_success=after_success)
-    write_text(folder / "metrics.jsonl", "")
+    write_text(folder / "metrics.jsonl", "")  # lines are appended
     if heldout is not None:
         heldout_sampler = WindowSampler(heldout, policy.config)
         before, _ = log_heldout_error(folder, 0, policy, sampler, heldout_sampler, text)
@@ -278,10 +278,12 @@ def adapt_checkpoint(
         after, of_mean_action = log_heldout_error(
             folder, settings.steps, adapted, sampler, heldout_sampler, text
         )
-        columns = {"step 0": before, f"step {settings.steps}": after}
-        columns["the mean action"] = of_mean_action
         table = report.heldout_table(
-            {title: {demonstrations.task: error} for title, error in columns.items()}
+            {
+                "step 0": {sampler.task: before},
+                f"step {settings.steps}": {sampler.task: after},
+                "the mean action": {sampler.task: of_mean_action},
+            }
         )
         print(table, flush=True)
         write_text(
@@ -317,7 +319,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Adapts a policy to one task (Algorithm 2).")
     group = parser.add_argument_group("run")
     add = group.add_argument
-    add("--task", nargs="+", help="tasks of the suite's simulator, or `novel`: the suite's own")
+    add("--task", nargs="+", help="tasks of the suite's simulator, or `novel`: all its novel ones")
     add("--suite", help="of the run to start from, and of the tasks (default: the run's, or ml10)")
     add("--data", default="data", help="folder of the demonstrations, or one file (default: data)")
     add("--checkpoint", help="file or run folder to start from (default: the newest run's last)")

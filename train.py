@@ -223,8 +223,8 @@ def learning_rate(step: int, settings: Settings) -> float:
     """Linear warm-up, then half a cosine, to zero one step after the last."""
     if step < settings.warmup:
         return settings.lr * (step + 1) / settings.warmup
-    progress = (step - settings.warmup) / max(1, settings.steps - settings.warmup)  # 0 to 1
-    return settings.lr * 0.5 * (1 + math.cos(math.pi * progress))
+    done, steps = step - settings.warmup, max(1, settings.steps - settings.warmup)
+    return settings.lr * 0.5 * (1 + math.cos(math.pi * done / steps))
 
 
 @dataclass
@@ -277,12 +277,11 @@ def meta_train(
     Raises:
         UserError: the loss or its gradient is not finite. The step changed nothing then.
     """
-    policy, parameters = state.policy, dict(state.policy.named_parameters())
-    n = settings.support + settings.query
+    policy = state.policy
     my_tasks = list(enumerate(samplers))[rank::world]
 
-    # Several tasks run at once if their demonstrations have one length, and can be stacked. The
-    # shapes are then the same in every step, so on a GPU each kind of step can be one CUDA graph.
+    # Where all demonstrations have one length several tasks can run at once. As the shapes are the
+    # same in every step then, on a GPU either kind of step can also be one CUDA graph.
     lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
     vectorize = settings.vectorize if len(lengths) == 1 else 1
     without_inner_step = partial(multi_task_gradient, policy, bfloat16=settings.bfloat16)
@@ -293,10 +292,18 @@ def meta_train(
 
     for step in range(state.step, settings.steps):  # lines 2, 22
         inner = step >= settings.pretrain_steps
-        batches = [  # lines 3 to 6, 9
-            task_batch(policy, samplers[t], text[t], n, (settings.seed, step, i), settings, inner)
-            for i, t in my_tasks
-        ]
+        batches = []
+        for i, task in my_tasks:  # lines 3 to 6, 9
+            batch = task_batch(
+                policy,
+                samplers[task],
+                text[task],
+                n=settings.support + settings.query,
+                seed=(settings.seed, step, i),
+                settings=settings,
+                inner=inner,
+            )
+            batches.append(batch)
 
         # The gradient of the mean loss over my tasks
         if inner:
@@ -319,7 +326,7 @@ def meta_train(
             )
 
         # One step of AdamW, and one of the moving average, which is what is kept and rolled out
-        for name, parameter in parameters.items():
+        for name, parameter in policy.named_parameters():
             parameter.grad = gradients[name]
         state.optimizer.param_groups[0]["lr"] = lr = learning_rate(step, settings)
         state.optimizer.step()  # line 20
@@ -398,9 +405,11 @@ def restore(
     started with other settings, or on other recordings.
     """
     policy, config = state.policy, state.policy.config
-    averaged, info = model.load(path, policy.normalizer.action_scale.device)
-    if "training" not in info:
-        raise UserError(f"{path} is no last.pt of train.py: there is no training to go on with")
+    averaged, info = model.load(
+        path,
+        policy.normalizer.action_scale.device,
+        needs=(*evaluate.TRAINED, "training", "recordings", "provenance"),
+    )
 
     settings_then = Settings(**info["arguments"])  # what it lacks is newer, and as by default
     may_differ = set(FREE_TO_CHANGE)
