@@ -57,7 +57,7 @@ COLLECTED = 10  # demonstrations of a simulator's task; of a file all are used
 
 @dataclass(frozen=True)
 class Settings:
-    """What an adaptation is made of; each field is a flag. None: as the preset has it."""
+    """What an adaptation is made of; each field is a flag. None is filled in later."""
 
     steps: int = setting(200, "gradient steps (default: 200)", least=1)
     batch: int | None = setting(None, f"windows a step{common.describe_presets(BATCH)}", least=1)
@@ -92,7 +92,7 @@ def adapt_policy(
     learning_rates: dict[str, float],
     seed: int = 0,
 ) -> Iterator[tuple[int, float, DAMIPolicy]]:
-    """Adapts a copy of a policy to the demonstrations of one task (Algorithm 2, lines 2 to 17).
+    """Adapts a copy of a policy to the demonstrations of one task (Algorithm 2 without its line 3).
 
     Args:
         policy: the meta-trained (EMA) policy; it is left as it is.
@@ -196,7 +196,7 @@ def log_heldout_error(
 
 
 def checkpoint_after(folder: Path, step: int) -> Path:
-    """The checkpoint of an adaptation that goes on after this step."""
+    """The file of the policy as it is after this step, which is not the last one."""
     return folder / f"adapted-{step:05d}.pt"
 
 
@@ -307,7 +307,7 @@ def read_instructions(paths: dict[str, Path], settings: Settings) -> dict[str, s
     instructions = {}
     for task, path in paths.items():
         demonstrations = load_demonstrations(path).take(settings.demonstrations)
-        hold_out(demonstrations, settings.held_out)
+        hold_out(demonstrations, settings.held_out)  # only to check that there are enough
         instructions[task] = demonstrations.instruction
     return instructions
 
@@ -376,7 +376,7 @@ def check_recording(
 
 
 def claim_folders(folders: Iterable[Path], checkpoint: Path, overwrite: bool) -> list[Path]:
-    """The old results in the folders, which are to be removed, see `evaluate.claim_results`.
+    """Makes the folders, and returns the old results in them, see `evaluate.claim_results`.
 
     Raises UserError if `checkpoint` is one of them.
     """
@@ -400,7 +400,7 @@ def adapt_tasks(
     simulator: Simulator | None,
     workers: int | None,
 ) -> tuple[dict[str, Successes], float]:
-    """Adapts a policy to each task by itself, and rolls it out before, in between and after.
+    """Adapts a policy to each task separately; rolls it out before, in between and after.
 
     Args:
         checkpoint: the policy.
