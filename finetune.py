@@ -371,8 +371,8 @@ def check_recording(
     if names is not None and list(names) != [recording.task]:
         raise UserError(f"{file} is a recording of {recording.task}, not of {' '.join(names)}")
     if simulator is not None:
-        check_task(simulator, recording.task)
         check_recipe(recording, file, simulator.recipe)
+        check_task(simulator, recording.task)
 
 
 def claim_folders(folders: Iterable[Path], checkpoint: Path, overwrite: bool) -> list[Path]:
@@ -535,8 +535,14 @@ def main(argv: Sequence[str] | None = None) -> None:
             **common.provenance("finetune.py", argv, device),
             **config_overrides,
         }
-        paper = report.paper_columns(suite, [policy.config.policy])
-        print(f"\n{report.write_report(out, results, provenance, paper=paper)}")
+        table = report.write_report(
+            out,
+            results,
+            provenance,
+            parts=evaluate.group_tasks(tasks, simulator, suite),
+            paper=report.paper_columns(suite, [policy.config.policy]),
+        )
+        print(f"\n{table}")
 
 
 if __name__ == "__main__":
