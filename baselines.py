@@ -58,7 +58,7 @@ from model import (
 def draw(
     function: Callable, *shape: int, like: Tensor, generator: Generator | None = None
 ) -> Tensor:
-    """`torch.randn` or `torch.rand` of a shape, by a generator on any device, to that of `like`."""
+    """Calls torch.randn or torch.rand on the generator's device, for a result on that of `like`."""
     source = like.device if generator is None else generator.device
     return function(*shape, generator=generator, device=source).to(like.device)
 
@@ -138,8 +138,8 @@ class FlowPolicy(DP3Policy):
         v_t, v_r = velocities.chunk(2)  # 2 x (B, H, A)
         f_t = x_t + (s - t) * v_t
         f_r = x_r + (s - r) * v_r
-        far = s - t > 1.01 * self.STEP
-        distance = (f_t - f_r) ** 2 + self.WEIGHT * far * (v_t - v_r) ** 2  # (B, H, A)
+        r_before_s = s - t > 1.01 * self.STEP  # r < s, with a margin for rounding
+        distance = (f_t - f_r) ** 2 + self.WEIGHT * r_before_s * (v_t - v_r) ** 2  # (B, H, A)
         return distance.mean() / self.STEP**2
 
     forward = loss
@@ -167,7 +167,7 @@ class FlowPolicy(DP3Policy):
 def associative_scan(a: Tensor, b: Tensor) -> Tensor:
     """h_l = a_l h_{l-1} + b_l along dim 1, from h_{-1} = 0: (B, L, ...) twice -> (B, L, ...).
 
-    Two steps in a row are one step of the same kind, (a' a, a' b + b'). Every place is therefore
+    A step (a, b) and then (a', b') are one step (a' a, a' b + b'). Every place is therefore
     joined with the one before it, then with the one two before, four, ...: log2(L) times, each for
     all places at once, where the recurrence takes L. What came before the first changes nothing.
     """
@@ -251,7 +251,8 @@ class MambaResidualBlock(nn.Module):
     def __init__(self, block: ResidualBlock, config: PolicyConfig, index: int):
         super().__init__()
         self.conv1, self.film, self.residual = block.conv1, block.film, block.residual
-        self.condition_dim, self.first_branch = config.condition_dim, index * self.BRANCHES
+        self.condition_dim = config.condition_dim
+        self.first_branch = index * self.BRANCHES
         width = self.conv1[0].out_channels
         self.mamba = MixerBlock(Mamba(width), width)
         self.attention = MixerBlock(Attention(width, self.HEADS), width)
@@ -497,10 +498,10 @@ class FrequencyTransformer(nn.Module):
 class FreqPolicy(DP3Policy):
     """Masked autoregression over frequencies (Zhong et al., arXiv 2506.01583).
 
-    Training: the first c frequencies of an action chunk, c from 0 to H, most of its places hidden,
-    are what the Transformer sees; a diffusion head recovers each of the clean actions. Drawing:
-    four rounds with c = 0, 5, 10, 16 of 16, each on the low frequencies of the round before, at
-    places of which ever fewer are hidden.
+    Training: the Transformer sees an action chunk reduced to its first c frequencies, c from 0 to
+    H, with most of its places hidden. A diffusion head recovers each of the clean actions.
+    Sampling: four rounds, with c = 0, 5, 10, 16 of 16. Each sees the low frequencies of the actions
+    of the round before, and in each fewer places are hidden.
 
     Left open, and chosen: condition tokens stand in the sequence (the code also attends to them
     separately, and has gated MLPs); the share of hidden places is drawn for each window (there: for

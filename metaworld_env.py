@@ -189,14 +189,16 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """Begins an episode; without a seed one is drawn. Returns (observation, info)."""
         super().reset(seed=seed)
-        self.begin(int(self.np_random.integers(2**31)) if seed is None else seed)
+        if seed is None:
+            seed = int(self.np_random.integers(2**31))
+        self.begin(seed)
         return self.observe(), {"success": False}
 
     def begin(self, seed: int) -> None:
         """Begins the episode of this seed without casting rays."""
         self.sawyer_env.seed(seed)
         self.expert_observation, _ = self.sawyer_env.reset()
-        # Without this the markers are still where the last episode had them.
+        # Moves the goal markers to this episode's goal: they are still where the last one had them.
         mujoco.mj_forward(self.sawyer_env.model, self.sawyer_env.data)
         self.steps = 0
 
@@ -207,10 +209,11 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
         """Takes one step without casting rays. Returns (reward, truncated, info)."""
-        action = np.clip(np.asarray(action, dtype=np.float32), -1, 1)
+        action = np.asarray(action, dtype=np.float32)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"an action is four finite numbers, not {action}")
 
+        action = np.clip(action, -1, 1)
         self.expert_observation, reward, _, _, info = self.sawyer_env.step(action)
         self.steps += 1
         truncated = self.steps >= self.episode_steps

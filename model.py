@@ -61,7 +61,7 @@ class PolicyConfig:
     demo_encoder: str = "vmt"  # vmt | none, and of baselines.py mlp; see `demo_encoders`
     demo_stride: int = 1  # the demonstration encoder reads every demo_stride-th frame
     demo_positions: int = 200  # learned positions: the longest demonstration, after the stride
-    demo_dim: int = 128  # the table calls it "Action Dim"
+    demo_dim: int = 128  # the paper's table calls it "Action Dim"
     vmt_layers: int = 2
     vmt_heads: int = 4
     tcfm: str = "down"  # which level of the denoiser reads U2T's output: down | mid | up | none
@@ -112,7 +112,10 @@ class PolicyConfig:
         H, To, Ta = self.horizon, self.n_obs_steps, self.n_action_steps
         most = H - To + 1
         if Ta > most:
-            raise ValueError(f"n_action_steps {Ta}: horizon {H} has {most} after observation {To}")
+            raise ValueError(
+                f"n_action_steps is {Ta}: of horizon {H} there are {most} actions after "
+                f"n_obs_steps {To}"
+            )
         levels = len(self.unet_widths)
         if H % 2 ** (levels - 1):
             raise ValueError(
@@ -211,7 +214,7 @@ class PointNetEncoder(nn.Module):
 
     The maximum makes it blind to the order of the points. A point that has the maximum in no
     channel gets no gradient. Only the others, PointNet's critical points, are therefore
-    differentiated (`CriticalPoints`): about a third of all.
+    differentiated, see `CriticalPoints`.
     """
 
     def __init__(
@@ -279,7 +282,7 @@ demo_encoders: dict[str, type[nn.Module]] = {"vmt": VisualMotorTrajectory}
 
 
 class UnpairedUnifiedTask(nn.Module):
-    """U2T: fuses demonstration, instruction and h_k, and is read at h_k's place (Eqs. 6 and 8).
+    """U2T: fuses demonstration, instruction and h_k, and returns h_k's token (Eqs. 6 and 8).
 
     The sequence is [demonstration tokens | text token | h_k]. Only h_k differs from window to
     window and from one diffusion step to the next. With one layer (the default) the keys and values
@@ -445,11 +448,11 @@ class ConditionalUNet1d(nn.Module):
 
         self.mid = nn.ModuleList(ResidualBlock(widths[-1], widths[-1], config) for _ in range(2))
         self.up = nn.ModuleList()
-        for d_out, d_in in pairwise(reversed(widths)):
-            # d_out channels come up from below, and d_out from the skip connection
-            block1 = ResidualBlock(2 * d_out, d_in, config)
-            block2 = ResidualBlock(d_in, d_in, config)
-            upsample = nn.ConvTranspose1d(d_in, d_in, 4, stride=2, padding=1)
+        for below, width in pairwise(reversed(widths)):
+            # `below` channels come up from the level below, and as many from the skip connection
+            block1 = ResidualBlock(2 * below, width, config)
+            block2 = ResidualBlock(width, width, config)
+            upsample = nn.ConvTranspose1d(width, width, 4, stride=2, padding=1)
             self.up.append(nn.ModuleList([block1, block2, upsample]))
         self.head = nn.Sequential(
             ConvBlock(widths[0], widths[0], config.kernel_size, config.n_groups),
@@ -514,16 +517,18 @@ class DiffusionSchedule(nn.Module):
     def step(self, prediction: Tensor, k: int, noisy: Tensor) -> Tensor:
         """One DDIM step from k to k - K / inference_steps, (B, H, A) -> (B, H, A).
 
-        The noise that is put back leads from the prediction, not clipped, to `noisy`. DP3 pins
-        diffusers 0.11.1, which puts back the predicted sample itself (sampler `dp3`): every step
-        then asks again from a guess without noise, and more rollouts succeed.
+        Sampler `ddim` puts back the noise that leads from the prediction, before clipping, to
+        `noisy`. DP3 pins diffusers 0.11.1, which puts back the predicted sample instead of noise
+        (sampler `dp3`): every step then starts from a guess without noise, and more rollouts
+        succeed.
         """
         stride = self.diffusion_steps // self.inference_steps
         a = self.alphas_cumprod[k]
         a_next = self.alphas_cumprod[k - stride] if k >= stride else torch.ones_like(a)
-        noise = (noisy - a.sqrt() * prediction) / (1 - a).sqrt()
         if self.sampler == "dp3":
             noise = prediction
+        else:
+            noise = (noisy - a.sqrt() * prediction) / (1 - a).sqrt()
         return a_next.sqrt() * prediction.clamp(-1, 1) + (1 - a_next).sqrt() * noise
 
 
@@ -538,7 +543,7 @@ class Recording(Protocol):
 class Normalizer(nn.Module):
     """Maps points, state and action to [-1, 1], each coordinate by its range in the data.
 
-    Of a point that is its position. Features of points, such as colours in [0, 1], pass unchanged.
+    Only a point's position is mapped; its features, such as colours in [0, 1], pass unchanged.
     """
 
     def __init__(self, state_dim: int, action_dim: int, point_dim: int = 3):
@@ -550,8 +555,8 @@ class Normalizer(nn.Module):
     def fit(self, recordings: Iterable[Recording]) -> None:
         """Sets the ranges to those of all recordings together.
 
-        A coordinate that hardly moves (range under 1e-4) is centred and not stretched; of an action
-        it is, since what is drawn from [-1, 1] must come back as what the demonstrations did.
+        A coordinate that hardly moves (range under 1e-4) is centred and not stretched. One of an
+        action is stretched, so that a drawn value in [-1, 1] maps back to almost that constant.
         """
         recordings = list(recordings)
         for name in ("points", "state", "action"):
@@ -604,7 +609,7 @@ class DAMIPolicy(nn.Module):
     Raises ValueError for the configuration of another policy, or one that does not fit this class.
     """
 
-    # What another policy may say otherwise:
+    # What a subclass may override:
     requires: ClassVar[dict[str, str]] = {}  # the fields of its configuration with only one value
     conditioned_by_h: ClassVar[bool] = True  # whether its denoiser is modulated by h_k
 
@@ -844,7 +849,7 @@ class DP3Policy(DAMIPolicy):
 def ema_model(policy: DAMIPolicy) -> AveragedModel:
     """The exponential moving average of a policy in training; the averaged policy is its `.module`.
 
-    `.update_parameters(policy)` belongs after each step. The decay grows as the paper's.
+    `.update_parameters(policy)` must be called after each step. The decay grows as in the paper.
     """
 
     @torch.no_grad()
@@ -1129,7 +1134,7 @@ class CriticalPoints(torch.autograd.Function):
     def indices(marked: Tensor, channels: int) -> Tensor:
         """(..., N) int8 -> (..., M) int64: critical points first, then others.
 
-        M is the largest number of critical points in any cloud.
+        M is the largest number of critical points in any cloud (on a GPU a bound of it).
         """
         if marked.is_cuda:
             most = min(channels, marked.shape[-1])  # a bound: the host does not wait for the GPU

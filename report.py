@@ -138,7 +138,7 @@ def heldout_table(columns: dict[str, dict[str, float]]) -> str:
 
     `columns` are title -> task -> error, see `evaluate.evaluate_heldout`.
     """
-    tasks = list(next(iter(columns.values())))
+    tasks = list(next(iter(columns.values())))  # all columns have the same
     rows = [["held-out action error", *columns]]
     for task in tasks:
         rows.append([task, *(f"{errors[task]:.4f}" for errors in columns.values())])
@@ -196,7 +196,8 @@ def plot_success(
     tasks = list(next(iter(columns.values())))
     paper = with_any_of(tasks, paper or {})
     n_bars = len(columns) + len(paper)
-    places, width = np.arange(len(tasks)), 0.8 / n_bars
+    places = np.arange(len(tasks))
+    width = 0.8 / n_bars
     figure = Figure(figsize=(max(4.5, 2 + 0.9 * len(tasks)), 3.6), layout="constrained")
     axes = figure.subplots()
 
@@ -286,7 +287,8 @@ def plot_demonstration(
     """
     from matplotlib.figure import Figure
 
-    frames, meta = demonstrations.episode(episode), demonstrations.meta
+    frames = demonstrations.episode(episode)
+    meta = demonstrations.meta
     clouds = positions(demonstrations.points[frames]).astype(np.float32)  # (T, N, 3)
     n_positions = meta.get("positions_in_state", 0)
     poses = demonstrations.state[frames, : 3 * n_positions]

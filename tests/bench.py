@@ -11,41 +11,56 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import chain
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.func import functional_call
 from torch.utils.flop_counter import FlopCounterMode
 
 import baselines
-from clip import text_features
-from data import Demonstrations, WindowSampler, farthest_point_sample, load_demonstrations
-from evaluate import EPISODES_A_JOB, SHIPPED_CHECKPOINT, TRAINED, checkpoints_of, rollout
+import model
+from clip import TextWeightsError
+from common import command_line, hardware, pick_device
+from data import (
+    Demonstrations,
+    RecordingError,
+    WindowSampler,
+    farthest_point_sample,
+    load_demonstrations,
+)
+from evaluate import (
+    EPISODES_A_JOB,
+    SHIPPED_CHECKPOINT,
+    checkpoints_of,
+    instruction_features,
+    load_trained,
+    rollout,
+)
 from finetune import BATCH, LEARNING_RATES, adapt_policy
 from maml import adapt, meta_gradient
-from model import PRESETS, PolicyConfig
-from scripts import hardware, load_checkpoint, pick_device
-from simulator import (
-    MetaWorldPointCloudEnv,
-    collect,
-    demonstration_seed,
-    evaluation_seed,
-    record_episode,
-    suite_tasks,
-)
+from metaworld_env import MetaWorld
+from model import PRESETS, CheckpointError, DAMIPolicy, PolicyConfig, split
+from simulator import collect, demonstration_seed, evaluation_seed, record_episode
 from tests.textbook import TextbookDP3, training_step
-from train import SETTINGS, Settings, multi_task_gradient, split, task_batch
+from train import SETTINGS, Settings, multi_task_gradient, task_batch
 
+SIMULATOR = MetaWorld()
+SUITE = "ml10"
 DP3 = {"demo_encoder": "none", "tcfm": "none"}
-TASKS = "reach", "shelf-place", "basketball"  # whose frames and episodes are timed
+TASKS = ("reach", "shelf-place", "basketball")  # whose frames and episodes are timed
+
+Batch = dict[str, Tensor]  # the arguments of a policy's loss
+
+# ---- Measuring -----------------------------------------------------------------------------------
 
 
 def medians(functions: dict[str, Callable[[], object]], repeat: int) -> dict[str, float]:
-    """Milliseconds of each, taking turns."""
+    """Milliseconds of each function; they take turns."""
     times = {name: [] for name in functions}
     for _ in range(repeat + 1):
         for name, function in functions.items():
@@ -60,8 +75,9 @@ def medians(functions: dict[str, Callable[[], object]], repeat: int) -> dict[str
 def step_medians(
     trainings: dict[str, Callable[[int], list[float]]], steps: int, rounds: int
 ) -> dict[str, float]:
-    """Milliseconds a step of each training, taking turns; a training returns the time at the end of
-    each of its steps.
+    """Milliseconds a step of each training; they take turns.
+
+    A training takes a number of steps, and returns the time at the end of each of them.
     """
     times = {name: [] for name in trainings}
     for _ in range(rounds):
@@ -71,8 +87,9 @@ def step_medians(
 
 
 def gflop(function: Callable[[], object]) -> float:
-    """Billions of operations in a call's matrix products and convolutions, a multiplication and an
-    addition each.
+    """Billions of operations in a call's matrix products and convolutions.
+
+    A multiplication and an addition are two operations.
     """
     with FlopCounterMode(display=False) as counter:
         function()
@@ -80,41 +97,57 @@ def gflop(function: Callable[[], object]) -> float:
 
 
 def matrix_rate(device: torch.device) -> float:
-    """The most this machine does: GFLOP a second in a square matrix product."""
+    """The most that this machine does: GFLOP a second in a square matrix product."""
     x = torch.randn(2048, 2048, device=device)
     return 2 * 2048**3 / 1e6 / medians({"product": lambda: x @ x}, 9)["product"]
 
 
+# ---- The simulator -------------------------------------------------------------------------------
+
+
 def frame_times(task: str, frames: int = 100) -> dict[str, float]:
-    """Milliseconds a frame of an expert episode, on one core: physics (and the expert), rays,
-    sampling.
+    """Milliseconds a frame of an expert's episode, on one core: physics, rays and sampling.
+
+    The expert's own time counts as physics.
     """
-    env = MetaWorldPointCloudEnv(task, PRESETS["small"].num_points)
-    env.begin(demonstration_seed(task, 0, 0))
+    env = SIMULATOR.make(task, PRESETS["small"].num_points)
+    env.begin(demonstration_seed(SIMULATOR, task, seed=0, attempt=0))
     times = {"physics": [], "rays": [], "sampling": []}
     for _ in range(frames):
-        t0 = time.perf_counter()
+        start = time.perf_counter()
         env.advance(env.expert_action())
-        t1 = time.perf_counter()
-        points = env.camera.points(env.simulator.data)
-        t2 = time.perf_counter()
+        advanced = time.perf_counter()
+        points = env.camera.points(env.sawyer_env.data)
+        cast = time.perf_counter()
         farthest_point_sample(points, env.num_points)
-        t3 = time.perf_counter()
-        for name, seconds in zip(times, (t1 - t0, t2 - t1, t3 - t2)):
-            times[name].append(1000 * seconds)
+        sampled = time.perf_counter()
+        times["physics"].append(1000 * (advanced - start))
+        times["rays"].append(1000 * (cast - advanced))
+        times["sampling"].append(1000 * (sampled - cast))
     return {name: statistics.median(values) for name, values in times.items()}
 
 
 def demonstration(task: str) -> Demonstrations:
-    """One recorded episode of the expert."""
-    env = MetaWorldPointCloudEnv(task)
-    seed = 0
-    while (episode := record_episode(env, demonstration_seed(task, 0, seed))) is None:
-        seed += 1
-    arrays = {name: np.stack(values) for name, values in episode[0].items()}
+    """One recorded episode of the expert: the first one that succeeds."""
+    env = SIMULATOR.make(task, SIMULATOR.recipe["num_points"])
+    attempt, episode = 0, None
+    while episode is None:
+        seed = demonstration_seed(SIMULATOR, task, seed=0, attempt=attempt)
+        episode = record_episode(env, seed)
+        attempt += 1
+    arrays, _ = episode
     return Demonstrations(
-        task, "bench", **arrays, episode_ends=np.array([len(arrays["action"])]), meta={}
+        task=task,
+        instruction="bench",
+        points=arrays["points"],
+        state=arrays["state"],
+        action=arrays["action"],
+        episode_ends=np.array([len(arrays["action"])]),
+        meta={},
     )
+
+
+# ---- A policy ------------------------------------------------------------------------------------
 
 
 class Bench:
@@ -123,18 +156,19 @@ class Bench:
     """
 
     def __init__(
-        self, config: PolicyConfig, preset: str, recorded: Demonstrations, device: torch.device
+        self, config: PolicyConfig, preset: str, recording: Demonstrations, device: torch.device
     ):
         torch.manual_seed(0)
-        self.preset, self.settings = preset, SETTINGS[preset]
-        self.policy = baselines.build_policy(config).to(device)
-        self.sampler: WindowSampler = WindowSampler(recorded, config, device=device)
-        self.policy.normalizer.fit(self.sampler.points, self.sampler.state, self.sampler.action)
-        self.text = torch.randn(config.text_dim, generator=torch.Generator().manual_seed(0)).to(
-            device
-        )
+        self.preset = preset
+        self.settings = SETTINGS[preset]
+        self.policy = model.build_policy(config).to(device)
+        self.sampler = WindowSampler(recording, config, device=device)
+        self.policy.normalizer.fit([self.sampler])
+        text = torch.randn(config.text_dim, generator=torch.Generator().manual_seed(0))
+        self.text = text.to(device)
 
-    def batches(self, tasks: int) -> list[dict[str, torch.Tensor]]:
+    def batches(self, tasks: int) -> list[Batch]:
+        """A batch of an outer step for each of so many tasks, all of them of the one recording."""
         n = self.settings.support + self.settings.query
         return [
             task_batch(self.policy, self.sampler, self.text, n, (0, 0, task), self.settings)
@@ -142,69 +176,88 @@ class Bench:
         ]
 
     def outer_step(
-        self,
-        batches: list[dict[str, torch.Tensor]],
-        first_order: bool,
-        vectorize: int | None = None,
+        self, batches: list[Batch], *, first_order: bool, vectorize: int | None = None
     ) -> None:
         meta_gradient(
-            lambda params, batch: functional_call(self.policy, params, (), batch),
+            partial(loss_of, self.policy),
             dict(self.policy.named_parameters()),
             (split(batch, self.settings.support) for batch in batches),
-            self.settings.inner_lr,
+            lr=self.settings.inner_lr,
             first_order=first_order,
             vectorize=vectorize or self.settings.vectorize,
         )
 
-    def one_by_one(self, batches: list[dict[str, torch.Tensor]]) -> None:
+    def one_task_at_a_time(self, batches: list[Batch]) -> None:
         """Multi-task training without a batch over tasks."""
         for batch in batches:
             multi_task_gradient(self.policy, [batch])
 
     def adapt(self, steps: int) -> list[float]:
         """The time at the end of each step of finetune.py."""
-        how = steps, BATCH[self.preset], LEARNING_RATES
-        training = adapt_policy(self.policy, self.sampler, self.text, *how)
+        training = adapt_policy(
+            self.policy,
+            self.sampler,
+            self.text,
+            steps=steps,
+            batch=BATCH[self.preset],
+            learning_rates=LEARNING_RATES,
+        )
         return [time.perf_counter() for _ in training]
 
     def textbook(self, steps: int) -> list[float]:
         """The same for a textbook's training of the same network on the same windows."""
-        policy, average = (TextbookDP3(self.policy.config).to(self.text.device) for _ in range(2))
+        policy = TextbookDP3(self.policy.config).to(self.text.device)
+        average = TextbookDP3(self.policy.config).to(self.text.device)
         policy.load_state_dict(self.policy.state_dict())
         optimizer = torch.optim.AdamW(policy.parameters(), lr=1e-4)
-        times, generator, n = [], torch.Generator().manual_seed(0), BATCH[self.preset]
+        generator = torch.Generator().manual_seed(0)
+        n, times = BATCH[self.preset], []
         for _ in range(steps):
             noise = self.policy.draw_noise_and_timesteps(n, generator)
-            batch = self.sampler.sample(n, generator) | noise
-            training_step(policy, average, optimizer, batch)
+            windows = self.sampler.sample(n, generator)
+            training_step(policy, average, optimizer, {**windows, **noise})
             times.append(time.perf_counter())
         return times
 
     @torch.no_grad()
-    def encode(self) -> tuple[torch.Tensor, ...] | None:
+    def encode(self) -> tuple[Tensor, ...] | None:
         return self.policy.encode_demo(self.text[None], **self.sampler.demonstration(0))
 
-    def control(self) -> Callable[[], torch.Tensor]:
-        context, frames = self.encode(), self.sampler.gather(torch.tensor([100]))
+    def control(self) -> Callable[[], Tensor]:
+        """What draws one chunk of actions."""
+        context = self.encode()
+        frames = self.sampler.gather(torch.tensor([100]))
         return lambda: self.policy.sample_actions(frames["points"], frames["state"], context)
 
 
+def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: Batch) -> Tensor:
+    """The loss () of a policy with these parameters in place of its own."""
+    return functional_call(policy, params, (), batch)
+
+
 def episode_seconds(task: str, device: torch.device, repeat: int) -> float:
-    """Seconds one core takes for one episode of 200 steps, `small`: as in evaluate.py, never
-    successful (untrained).
+    """Seconds that one core takes for an episode of 200 steps, rolled out as in evaluate.py.
+
+    The policy is `small`, untrained, so that no episode ends early by success.
     """
     bench = Bench(PRESETS["small"], "small", demonstration(task), device)
-    envs = [
-        MetaWorldPointCloudEnv(task, bench.policy.config.num_points) for _ in range(EPISODES_A_JOB)
-    ]
-    seeds = [evaluation_seed(0, i) for i in range(EPISODES_A_JOB)]
+    num_points = bench.policy.config.num_points
+    environments = [SIMULATOR.make(task, num_points) for _ in range(EPISODES_A_JOB)]
+    seeds = [evaluation_seed(0, episode) for episode in range(EPISODES_A_JOB)]
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
 
-    def run() -> None:
-        rollout(bench.policy.eval(), envs, seeds, bench.sampler, bench.text, torch.Generator())
+    def roll_out() -> None:
+        rollout(
+            bench.policy.eval(),
+            environments=environments,
+            seeds=seeds,
+            sampler=bench.sampler,
+            text=bench.text,
+            generator=torch.Generator(),
+        )
 
-    milliseconds = medians({task: run}, repeat)[task]
+    milliseconds = medians({task: roll_out}, repeat)[task]
     torch.set_num_threads(threads)
     return milliseconds / 1000 / EPISODES_A_JOB
 
@@ -212,252 +265,343 @@ def episode_seconds(task: str, device: torch.device, repeat: int) -> float:
 def peak_memory(tasks: int) -> float:
     """GB that a process of its own holds at most for second-order outer steps of `small`."""
     command = [sys.executable, "-m", "tests.bench", "--peak-memory", str(tasks)]
-    return float(
-        subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1]
-    )
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return float(printed.split()[-1])
 
 
-def inner_step_table(checkpoint: Path, folder: str, rate: float | None, seeds: int = 5) -> None:
-    """What an inner step does to a policy: windows of each task as in its training, seeds 0 to 4.
+def print_peak_memory(tasks: int, device: torch.device) -> None:
+    """What that process does."""
+    import resource  # POSIX has it
 
-    First at the rate of its training, on base and on novel tasks, by what the policy is shown. Then
-    on base tasks with the mean over a window's H x A numbers, as DP3 and this code have it, and
-    with their sum, as the paper writes the loss: an inner rate H x A times as large.
-    """
-    policy, info = load_checkpoint(checkpoint, needs=TRAINED)
-    (base, novel), trained = suite_tasks("ml10"), info["arguments"]
-    recorded = [load_demonstrations(path) for path in collect(base + novel, folder).values()]
-    text, _ = text_features([d.instruction for d in recorded], None, info["text_weights"])
-    samplers = [
-        WindowSampler(
-            demonstrations,
-            policy.config,
-            after_success=trained["after_success"],
-            augment=trained["augment"],
+    bench = Bench(PRESETS["small"], "small", demonstration("drawer-close"), device)
+    for _ in range(2):
+        bench.outer_step(bench.batches(tasks), first_order=False)
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
+
+
+# ---- What an inner step does to a policy ---------------------------------------------------------
+
+INNER_STEP_SEEDS = 5  # windows are drawn of seeds 0 to 4
+
+
+class InnerStepBench:
+    """A trained policy, and windows of every task of ML10, drawn as in its training."""
+
+    def __init__(self, checkpoint: Path, folder: str):
+        self.policy, info = load_trained(checkpoint)
+        self.arguments = info["arguments"]  # the settings of its training
+        base, novel = SIMULATOR.tasks(SUITE)
+        self.tasks = {"base": base, "novel": novel}
+        recordings = {
+            task: load_demonstrations(path)
+            for task, path in collect(SIMULATOR, base + novel, folder).items()
+        }
+        self.text, _ = instruction_features(
+            {task: recording.instruction for task, recording in recordings.items()},
+            weights=None,
+            identity=info["text_weights"],
+            device="cpu",
         )
-        for demonstrations in recorded
-    ]
-    params = {name: p.detach() for name, p in policy.named_parameters()}
-    n = trained["support"] + trained["query"]
+        self.samplers = {
+            task: WindowSampler(
+                recording,
+                self.policy.config,
+                after_success=self.arguments["after_success"],
+                augment=self.arguments["augment"],
+            )
+            for task, recording in recordings.items()
+        }
+        self.params = {name: p.detach() for name, p in self.policy.named_parameters()}
+        self.loss_fn = partial(loss_of, self.policy)
 
-    def loss_fn(params: dict[str, torch.Tensor], batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        return functional_call(policy, params, (), batch)
+    def pairs(self, part: str, seed: int, settings: Settings) -> list[tuple[Batch, Batch]]:
+        """The windows of each base or novel task, split into support and query.
 
-    def change(new: dict[str, torch.Tensor], old: dict[str, torch.Tensor]) -> float:
-        new, old = (torch.cat([x.flatten() for x in each.values()]) for each in (new, old))
-        return ((new - old).norm() / old.norm()).item()
+        The dropouts of `settings` decide what a batch says of its task.
+        """
+        support = self.arguments["support"]
+        n = support + self.arguments["query"]
+        pairs = []
+        for index, task in enumerate(self.tasks[part]):
+            batch = task_batch(
+                self.policy,
+                self.samplers[task],
+                self.text[task],
+                n,
+                (seed, 0, index),
+                settings,
+                inner=True,
+            )
+            pairs.append(split(batch, support))
+        return pairs
 
-    def pairs_of(seed: int, split_: str, **shares: float) -> list[tuple[dict, dict]]:
-        how = Settings(**shares), True
-        of_tasks = slice(len(base)) if split_ == "base" else slice(len(base), None)
-        batches = [
-            task_batch(policy, sampler, feature, n, (seed, 0, index), *how)
-            for index, (sampler, feature) in enumerate(list(zip(samplers, text))[of_tasks])
-        ]
-        return [split(batch, trained["support"]) for batch in batches]
+    @torch.no_grad()
+    def loss(self, params: dict[str, Tensor], batch: Batch) -> float:
+        return self.loss_fn(params, batch).item()
 
-    rate = trained["inner_lr"] if rate is None else rate
-    print(f"\n{checkpoint}: query loss before -> after an inner step at {rate:g}, means\n")
+    def query_losses(self, part: str, inner_lr: float, settings: Settings) -> tuple[float, float]:
+        """The mean query losses before and after an inner step."""
+        losses = []
+        for seed in range(INNER_STEP_SEEDS):
+            for support, query in self.pairs(part, seed, settings):
+                adapted = adapt(self.loss_fn, self.params, support, inner_lr)
+                losses.append((self.loss(self.params, query), self.loss(adapted, query)))
+        before, after = np.mean(losses, axis=0)
+        return before, after
+
+    def changes(self, inner_lr: float) -> tuple[float, float, float, float]:
+        """What an inner step changes on base tasks, as shares of what was there before; medians.
+
+        Returns the changes of the weights, of the support loss, of the query loss and of the
+        meta-gradient. That is compared with the gradient without an inner step.
+        """
+        weights, support_losses, query_losses, gradients = [], [], [], []
+        for seed in range(INNER_STEP_SEEDS):
+            pairs = self.pairs("base", seed, Settings())
+            for support, query in pairs:
+                adapted = adapt(self.loss_fn, self.params, support, inner_lr)
+                weights.append(relative_change(adapted, self.params))
+                for batch, changes in ((support, support_losses), (query, query_losses)):
+                    changes.append(self.loss(adapted, batch) / self.loss(self.params, batch) - 1)
+            plain, _, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=0.0)
+            gradient, _, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=inner_lr)
+            gradients.append(relative_change(gradient, plain))
+        return (
+            float(np.median(weights)),
+            float(np.median(support_losses)),
+            float(np.median(query_losses)),
+            float(np.median(gradients)),
+        )
+
+
+def relative_change(new: dict[str, Tensor], old: dict[str, Tensor]) -> float:
+    """The norm of the difference of two dictionaries of tensors over the norm of the old one."""
+    new_vector = torch.cat([x.flatten() for x in new.values()])
+    old_vector = torch.cat([x.flatten() for x in old.values()])
+    return ((new_vector - old_vector).norm() / old_vector.norm()).item()
+
+
+def print_inner_step(checkpoint: Path, folder: str, inner_lr: float | None) -> None:
+    """Prints what an inner step does to a policy, on windows of each task as in its training.
+
+    The first table has it at the rate of the training, on base and on novel tasks, by what the
+    policy is shown. The second has it on base tasks with the mean over a window's H x A numbers, as
+    DP3 and this code have it, and with their sum, as the paper writes the loss: that is an inner
+    rate H x A times as large.
+    """
+    bench = InnerStepBench(checkpoint, folder)
+    if inner_lr is None:
+        inner_lr = bench.arguments["inner_lr"]
+    print(f"\n{checkpoint}: query loss before -> after an inner step at {inner_lr:g}, means\n")
     print("| the policy is shown | base tasks | novel tasks |\n|---|---|---|")
-    for shown, shares in {
-        "instruction, demonstration": {},
-        "demonstration": {"instruction_dropout": 1.0},
-        "nothing but the support windows": {"support_only": 1.0},
-    }.items():
+    inputs = {
+        "instruction, demonstration": Settings(),
+        "demonstration": Settings(instruction_dropout=1.0),
+        "nothing but the support windows": Settings(task_dropout=1.0),
+    }
+    for title, settings in inputs.items():
         cells = []
-        for split_ in ("base", "novel"):
-            losses = []
-            for support, query in chain(*(pairs_of(s, split_, **shares) for s in range(seeds))):
-                adapted = adapt(loss_fn, params, support, rate)
-                with torch.no_grad():
-                    losses.append([loss_fn(p, query).item() for p in (params, adapted)])
-            cells.append("{:.4f} -> {:.4f}".format(*np.mean(losses, axis=0)))
-        print(f"| {shown} | {' | '.join(cells)} |", flush=True)
+        for part in bench.tasks:
+            before, after = bench.query_losses(part, inner_lr, settings)
+            cells.append(f"{before:.4f} -> {after:.4f}")
+        print(f"| {title} | {' | '.join(cells)} |", flush=True)
 
     print("\n| inner step at 1e-4 on the | weights | support loss | query loss | meta-gradient |")
     print("|---|---|---|---|---|")
-    for name, numbers in {
-        "mean": 1,
-        "sum": policy.config.horizon * policy.config.action_dim,
-    }.items():
-        lr, moved, losses, gradient = 1e-4 * numbers, [], [], []
-        for seed in range(seeds):
-            pairs = pairs_of(seed, "base")
-            for support, query in pairs:
-                adapted = adapt(loss_fn, params, support, lr)
-                moved.append(change(adapted, params))
-                with torch.no_grad():
-                    after, before = (
-                        [loss_fn(p, b) for b in (support, query)] for p in (adapted, params)
-                    )
-                losses.append([(a / b - 1).item() for a, b in zip(after, before)])
-            plain, *_ = meta_gradient(loss_fn, params, pairs, lr=0.0)
-            gradient.append(change(meta_gradient(loss_fn, params, pairs, lr)[0], plain))
-        support, query = np.median(losses, axis=0)
-        cells = (
-            f"{np.median(moved):.1e} | {support:+.1%} | {query:+.1%} | {np.median(gradient):.1%}"
-        )
-        print(f"| {name} (medians) | {cells} |", flush=True)
+    config = bench.policy.config
+    for title, factor in {"mean": 1, "sum": config.horizon * config.action_dim}.items():
+        weights, support_loss, query_loss, gradient = bench.changes(1e-4 * factor)
+        cells = f"{weights:.1e} | {support_loss:+.1%} | {query_loss:+.1%} | {gradient:.1%}"
+        print(f"| {title} (medians) | {cells} |", flush=True)
 
 
-def table(title: str, rows: dict[str, float], unit: str = "") -> None:
+# ---- Tables --------------------------------------------------------------------------------------
+
+
+def print_table(title: str, rows: dict[str, float]) -> None:
     print(f"\n| {title} | |\n|---|---|")
     for name, value in rows.items():
-        print(f"| {name} | {value:.{2 if value < 20 else 0}f}{unit} |", flush=True)
+        digits = 2 if value < 20 else 0
+        print(f"| {name} | {value:.{digits}f} |", flush=True)
 
 
-def preset_table(bench: Bench, rate: float, repeat: int) -> None:
-    """Every kind of step of a preset, and how far it is from the machine's limit."""
+def print_simulator(device: torch.device, repeat: int) -> None:
+    """What a GPU has no part in: frames, episodes, and memory."""
+    print("\n| frame, one core, ms | physics | rays | sampling | all |\n|---|---|---|---|---|")
+    for task in TASKS:
+        times = list(frame_times(task).values())
+        cells = [f"{milliseconds:.1f}" for milliseconds in (*times, sum(times))]
+        print(f"| {task} | {' | '.join(cells)} |", flush=True)
+    print_table(
+        "evaluation, one core, `small`: seconds an episode of 200 steps",
+        {task: episode_seconds(task, device, repeat) for task in TASKS},
+    )
+    print_table(
+        "`small`, second order, peak memory, GB",
+        {f"{tasks} tasks": peak_memory(tasks) for tasks in (10, 20, 40)},
+    )
+
+
+def print_preset(bench: Bench, rate: float, repeat: int) -> None:
+    """Every kind of step of a preset, and how far it is from the machine's limit.
+
+    `rate` is that limit, see `matrix_rate`.
+    """
     batches, control = bench.batches(10), bench.control()
-    steps = {
-        "outer step, second order": lambda n=None: bench.outer_step(
-            batches, first_order=False, vectorize=n
+    second_order = partial(bench.outer_step, batches, first_order=False)
+    first_order = partial(bench.outer_step, batches, first_order=True)
+    one_batch = partial(multi_task_gradient, bench.policy, batches)
+    one_task_at_a_time = partial(bench.one_task_at_a_time, batches)
+    ms = {
+        **medians(
+            {
+                "outer step, second order": second_order,
+                "outer step, first order": first_order,
+                "multi-task step, all windows in one batch": one_batch,
+                "multi-task step, one task at a time": one_task_at_a_time,
+            },
+            repeat,
         ),
-        "outer step, first order": lambda n=None: bench.outer_step(
-            batches, first_order=True, vectorize=n
-        ),
-        "multi-task step, all windows in one batch": lambda: multi_task_gradient(
-            bench.policy, batches
-        ),
-        "multi-task step, one task at a time": lambda: bench.one_by_one(batches),
+        **step_medians({"adaptation step": bench.adapt}, steps=5, rounds=3),
+        **medians({"control step": control, "encoding the demonstration": bench.encode}, repeat),
     }
-    ms = medians(steps, repeat)
-    second, first, batch, single = ms.values()
-    ms |= step_medians({"adaptation step": bench.adapt}, steps=5, rounds=3)
-    ms |= medians({"control step": control, "encoding the demonstration": bench.encode}, repeat)
-    # Grouped convolutions, which vmap makes, are not counted rightly: outer steps are counted task
-    # by task.
-    counted = [lambda s=s: s(1) for s in list(steps.values())[:2]] + list(steps.values())[2:]
-    counted += [lambda: bench.adapt(1), control, bench.encode]
-    print(
-        f"\n| `{bench.preset}`, 10 tasks | ms | GFLOP | of the matrix product's rate "
-        "|\n|---|---|---|---|"
+    # The operations of outer steps are counted task by task, since those of grouped convolutions,
+    # which vmap makes, are not counted rightly.
+    operations = {
+        "outer step, second order": gflop(partial(second_order, vectorize=1)),
+        "outer step, first order": gflop(partial(first_order, vectorize=1)),
+        "multi-task step, all windows in one batch": gflop(one_batch),
+        "multi-task step, one task at a time": gflop(one_task_at_a_time),
+        "adaptation step": gflop(lambda: bench.adapt(1)),
+        "control step": gflop(control),
+        "encoding the demonstration": gflop(bench.encode),
+    }
+    print(f"\n| `{bench.preset}`, 10 tasks | ms | GFLOP | of the matrix product's rate |")
+    print("|---|---|---|---|")
+    for name, value in ms.items():
+        share = operations[name] / value * 1000 / rate
+        print(f"| {name} | {value:.1f} | {operations[name]:.2f} | {share:.0%} |", flush=True)
+    second = ms["outer step, second order"]
+    print_table(
+        f"`{bench.preset}`: second order over",
+        {
+            "first order": second / ms["outer step, first order"],
+            "one batch": second / ms["multi-task step, all windows in one batch"],
+            "one task at a time": second / ms["multi-task step, one task at a time"],
+        },
     )
-    for (name, value), call in zip(ms.items(), counted):
-        operations = gflop(call)
-        print(
-            f"| {name} | {value:.1f} | {operations:.2f} | {operations / value * 1000 / rate:.0%} |",
-            flush=True,
-        )
-    ratios = {
-        "first order": second / first,
-        "one batch": second / batch,
-        "one task at a time": second / single,
-    }
-    table(f"`{bench.preset}`: second order over", ratios)
 
 
-def policies_table(recorded: Demonstrations, device: torch.device, repeat: int) -> None:
-    """`small`: what training and control of each policy of baselines.py cost, taking turns."""
-    calls, actions = {}, {}
+def print_policies(recording: Demonstrations, device: torch.device, repeat: int) -> None:
+    """What training and control of each policy of baselines.py cost, `small`, taking turns."""
+    columns = ("multi-task step", "in bfloat16", "second order", "control step")
+    calls = {}
     for policy, presets in baselines.PRESETS.items():
-        bench = Bench(presets["small"], "small", recorded, device)
-        batches, actions[policy] = bench.batches(10), presets["small"].n_action_steps
-        calls |= {
-            (policy, "multi-task step"): lambda bench=bench, batches=batches: multi_task_gradient(
-                bench.policy, batches
-            ),
-            (policy, "in bfloat16"): lambda bench=bench, batches=batches: multi_task_gradient(
-                bench.policy, batches, bfloat16=True
-            ),
-            (policy, "second order"): lambda bench=bench, batches=batches: bench.outer_step(
-                batches, first_order=False
-            ),
-            (policy, "control step"): bench.control(),
-        }
+        bench = Bench(presets["small"], "small", recording, device)
+        batches = bench.batches(10)
+        step = partial(multi_task_gradient, bench.policy, batches)
+        calls[policy, "multi-task step"] = step
+        calls[policy, "in bfloat16"] = partial(step, bfloat16=True)
+        calls[policy, "second order"] = partial(bench.outer_step, batches, first_order=False)
+        calls[policy, "control step"] = bench.control()
     ms = medians(calls, repeat)
-    steps = "multi-task step | in bfloat16 | second order | control step | of so many actions"
-    print(f"\n| `small`, ms | {steps} |\n|---|---|---|---|---|---|")
-    for policy, n in actions.items():
-        cells = [f"{value:.0f}" for (name, _), value in ms.items() if name == policy]
-        print(f"| {policy} | {' | '.join(cells)} | {n} |", flush=True)
+    print(
+        f"\n| `small`, ms | {' | '.join(columns)} | of so many actions |\n|---|---|---|---|---|---|"
+    )
+    for policy, presets in baselines.PRESETS.items():
+        cells = [f"{ms[policy, column]:.0f}" for column in columns]
+        print(f"| {policy} | {' | '.join(cells)} | {presets['small'].n_action_steps} |", flush=True)
 
 
-def main(argv: list[str] | None = None) -> None:
+def print_beside_dp3(
+    preset: str,
+    recording: Demonstrations,
+    device: torch.device,
+    *,
+    steps: int,
+    rounds: int,
+    repeat: int,
+) -> None:
+    """DAMI's steps beside those of the same network without a demonstration, which is DP3's."""
+    dami = Bench(PRESETS[preset], preset, recording, device)
+    dp3 = Bench(replace(PRESETS[preset], **DP3), preset, recording, device)
+    ms = step_medians(
+        {"DAMI": dami.adapt, "DP3": dp3.adapt, "DP3 as a textbook writes it": dp3.textbook},
+        steps,
+        rounds,
+    )
+    print_table(f"`{preset}`, adaptation step, {BATCH[preset]} windows, ms", ms)
+    control = medians({"DAMI": dami.control(), "DP3": dp3.control()}, repeat)
+    print_table(f"`{preset}`, control step, ms", control)
+    ours_over_the_textbooks = ms["DP3"] / ms["DP3 as a textbook writes it"]
+    print_table(
+        f"`{preset}`, ratios",
+        {
+            "adaptation step, DAMI over DP3": ms["DAMI"] / ms["DP3"],
+            "control step, DAMI over DP3": control["DAMI"] / control["DP3"],
+            "training step of DP3, ours over the textbook's": ours_over_the_textbooks,
+        },
+    )
+
+
+def print_paper(recording: Demonstrations, device: torch.device, repeat: int) -> None:
+    """The outer step at the paper's size."""
+    bench = Bench(PRESETS["paper"], "paper", recording, device)
+    batches = bench.batches(1)
+    ms = medians(
+        {
+            "second order": partial(bench.outer_step, batches, first_order=False),
+            "first order": partial(bench.outer_step, batches, first_order=True),
+        },
+        repeat,
+    )
+    seconds = {name: value / 1000 for name, value in ms.items()}
+    print_table("`paper`, outer step, one task, s", seconds)
+
+
+# ---- Command line --------------------------------------------------------------------------------
+
+
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--paper",
-        action="store_true",
-        help="the ratios at the paper's size too (10 minutes more, 16 GB)",
-    )
-    parser.add_argument("--network", action="store_true", help="only its steps")
-    parser.add_argument("--inner-step", action="store_true", help="only what it does to a policy")
-    parser.add_argument("--data", default="data", help="demonstrations that --inner-step reads")
-    parser.add_argument("--inner-lr", type=float, help="its rate (default: of the training)")
-    parser.add_argument(
-        "--checkpoint", default=SHIPPED_CHECKPOINT, help="its policy, or run folder"
-    )
-    parser.add_argument("--repeat", type=int, default=5)
-    parser.add_argument("--device")
-    parser.add_argument("--peak-memory", type=int, help=argparse.SUPPRESS)
-    args = parser.parse_args(argv)
+    add = parser.add_argument
+    add("--paper", action="store_true", help="the paper's size too (10 minutes more, 16 GB)")
+    add("--network", action="store_true", help="only the network's steps")
+    add("--inner-step", action="store_true", help="only what it does to a policy")
+    add("--data", default="data", help="demonstrations that --inner-step reads")
+    add("--inner-lr", type=float, help="its rate (default: of the training)")
+    add("--checkpoint", default=SHIPPED_CHECKPOINT, help="its policy, or run folder")
+    add("--repeat", type=int, default=5)
+    add("--device")
+    add("--peak-memory", type=int, help=argparse.SUPPRESS)
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(argv)
     device = pick_device(args.device)
     if args.peak_memory:
-        import resource
-
-        bench = Bench(PRESETS["small"], "small", demonstration("drawer-close"), device)
-        for _ in range(2):
-            bench.outer_step(bench.batches(args.peak_memory), first_order=False)
-        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
+        print_peak_memory(args.peak_memory, device)
         return
     if args.inner_step:
-        return inner_step_table(checkpoints_of(args.checkpoint)[-1], args.data, args.inner_lr)
-    threads = torch.get_num_threads()
-    print(
-        f"{hardware(device)}, torch {torch.__version__}, {threads} threads, "
-        f"{time.strftime('%Y-%m-%d')}"
-    )
+        print_inner_step(checkpoints_of(args.checkpoint)[-1], args.data, args.inner_lr)
+        return
 
+    threads, today = torch.get_num_threads(), time.strftime("%Y-%m-%d")
+    print(f"{hardware(device)}, torch {torch.__version__}, {threads} threads, {today}")
     if not args.network:
-        print("\n| frame, one core, ms | physics | rays | sampling | all |\n|---|---|---|---|---|")
-        for task in TASKS:
-            times = frame_times(task)
-            cells = [f"{ms:.1f}" for ms in (*times.values(), sum(times.values()))]
-            print(f"| {task} | {' | '.join(cells)} |", flush=True)
-        episodes = {task: episode_seconds(task, device, args.repeat) for task in TASKS}
-        table("evaluation, one core, `small`: seconds an episode of 200 steps", episodes)
-        memory = {f"{tasks} tasks": peak_memory(tasks) for tasks in (10, 20, 40)}
-        table("`small`, second order, peak memory, GB", memory)
-
-    recorded = demonstration("drawer-close")
+        print_simulator(device, args.repeat)
+    recording = demonstration("drawer-close")
     rate = matrix_rate(device)
     print(f"\nmatrix product: {rate:.0f} GFLOP a second")
     for preset in ("small", "tiny"):
-        preset_table(Bench(PRESETS[preset], preset, recorded, device), rate, args.repeat)
-    policies_table(recorded, device, args.repeat)
-    for preset, steps, rounds in (("small", 4, 5), ("paper", 2, 3)):
-        if preset == "paper" and not args.paper:
-            continue
-        dami = Bench(PRESETS[preset], preset, recorded, device)
-        dp3 = Bench(replace(PRESETS[preset], **DP3), preset, recorded, device)
-        ms = step_medians(
-            {"DAMI": dami.adapt, "DP3": dp3.adapt, "DP3 as a textbook writes it": dp3.textbook},
-            steps,
-            rounds,
-        )
-        table(f"`{preset}`, adaptation step, {BATCH[preset]} windows, ms", ms)
-        control = medians({"DAMI": dami.control(), "DP3": dp3.control()}, args.repeat)
-        table(f"`{preset}`, control step, ms", control)
-        ratios = {
-            "adaptation step, DAMI over DP3": ms["DAMI"] / ms["DP3"],
-            "control step, DAMI over DP3": control["DAMI"] / control["DP3"],
-            "training step of DP3, ours over the textbook's": ms["DP3"]
-            / ms["DP3 as a textbook writes it"],
-        }
-        table(f"`{preset}`, ratios", ratios)
-        del dami, dp3
+        print_preset(Bench(PRESETS[preset], preset, recording, device), rate, args.repeat)
+    print_policies(recording, device, args.repeat)
+    print_beside_dp3("small", recording, device, steps=4, rounds=5, repeat=args.repeat)
     if args.paper:
-        bench = Bench(PRESETS["paper"], "paper", recorded, device)
-        batches = bench.batches(1)
-        orders = {"second order": False, "first order": True}
-        ms = medians(
-            {k: lambda f=f: bench.outer_step(batches, first_order=f) for k, f in orders.items()},
-            args.repeat,
-        )
-        table(
-            "`paper`, outer step, one task, s", {name: value / 1000 for name, value in ms.items()}
-        )
+        print_beside_dp3("paper", recording, device, steps=2, rounds=3, repeat=args.repeat)
+        print_paper(recording, device, args.repeat)
 
 
 if __name__ == "__main__":
-    main()
+    command_line(main, errors=(RecordingError, CheckpointError, TextWeightsError))

@@ -26,6 +26,7 @@ import common
 import data
 import simulator
 import train
+from clip import TextWeightsError
 from common import command_line
 from metaworld_env import (
     CAMERA,
@@ -121,4 +122,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, errors=(data.RecordingError, CheckpointError))
+    command_line(main, errors=(data.RecordingError, CheckpointError, TextWeightsError))

@@ -9,39 +9,50 @@ RESULTS.json holds for each run how it was trained and, for each report that mea
 episode (1: success, 0: not) with the command, hardware, seed and date.
 """
 
+import argparse
 import json
 import re
-import sys
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
 
-from data import write_atomically
-from evaluate import SHIPPED_CHECKPOINT, TRAINED
-from model import PRESETS
+import model
+from common import command_line, format_table, read_json_lines
+from data import write_text
+from evaluate import SHIPPED_CHECKPOINT, TRAINED, load_trained
+from model import CheckpointError
 from report import (
+    PAPER_NAMES,
+    PAPER_RESULTS,
     Successes,
-    draw_success,
     format_success,
     mean_interval,
     mean_success,
+    paper_columns,
+    plot_success,
     pooled_success,
+    save_png,
     wilson_interval,
 )
-from common import format_table
 from simulator import simulator_of
 from tests.runs import AGAIN, REPORTS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "RESULTS.json"
-PAPER = json.loads((ROOT / "assets" / "paper_results.json").read_text())
-TASKS = {
-    suite: dict(zip(("base", "novel"), simulator_of(suite).tasks(suite)))
-    for suite in ("ml10", "ml45")
-}
+PAPER = json.loads(PAPER_RESULTS.read_text())
+
+
+def tasks_of(suite: str) -> dict[str, list[str]]:
+    """The base and the novel tasks of a suite."""
+    base, novel = simulator_of(suite).tasks(suite)
+    return {"base": base, "novel": novel}
+
+
+TASKS = {"ml10": tasks_of("ml10"), "ml45": tasks_of("ml45")}
 DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022); the others are easy
     "medium": "basketball bin-picking box-close coffee-pull coffee-push hammer peg-insert-side "
     "push-wall soccer sweep sweep-into",
@@ -75,10 +86,7 @@ SWAPPED = {  # a run -> its panel in the swap chart
     "ml10-no-inner-loop-cpu-seed0": "what ships",
 }
 POLICIES = {  # of baselines.py -> what the paper calls it
-    "dp3": "DP3",
-    "flow": "FlowPolicy",
-    "mamba": "Mamba",
-    "freq": "FreqPolicy",
+    policy: name for policy, name in PAPER_NAMES.items() if policy != "dami"
 }
 ABLATION = {  # a row of the paper's ablation -> our variant, and what it is
     "baseline": ("baseline", "an MLP for VMT, no TCFM: the paper's Baseline"),
@@ -123,67 +131,129 @@ SHOWN = {  # a suite -> the columns of its tables: a variant, and what it is cal
         "ml45-dp3": "DP3",
     },
 }
-REPORT = {"base": ("base", 0), "novel": ("novel", "after")}  # what measures the tasks of a split
 
 
-def take(results: dict, run: Path) -> None:
+@dataclass(frozen=True)
+class Column:
+    """A column of a report (a name of `tests.runs.REPORTS`), by its name or its place."""
+
+    report: str
+    column: int | str = 0
+
+
+BASE, BEFORE, AFTER = Column("base"), Column("novel", "before"), Column("novel", "after")
+MEASURED_BY = {"base": BASE, "novel": AFTER}  # the tasks of a split
+
+Results = dict[str, dict[str, Any]]  # a run's name -> "training", and its reports by their names
+
+
+# ---- From runs to RESULTS.json -------------------------------------------------------------------
+
+
+def take(results: Results, run: Path) -> None:
     """Adds a run's training and the reports beside its folder to `results`."""
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    minutes = [line["seconds"] for line in lines if "loss" in line][-1] / 60
-    config = json.loads((run / "config.json").read_text())
-    results[run.name] = {"training": {"minutes": round(minutes, 1), **config}}
-    inner = [(line["loss_before"], line["loss"]) for line in lines if "loss_before" in line][-500:]
-    if inner:  # the query losses of the last 500 outer steps
-        before, after = np.mean(inner, axis=0).round(5).tolist()
-        results[run.name]["training"]["inner_step"] = {"before": before, "after": after}
+    steps = [line for line in read_json_lines(run / "metrics.jsonl") if "loss" in line]
+    training = {
+        "minutes": round(steps[-1]["seconds"] / 60, 1),
+        **json.loads((run / "config.json").read_text()),
+    }
+    inner_steps = [line for line in steps if "loss_before" in line][-500:]
+    if inner_steps:  # the mean query losses of the last 500 outer steps
+        training["inner_step"] = {
+            "before": round(float(np.mean([line["loss_before"] for line in inner_steps])), 5),
+            "after": round(float(np.mean([line["loss"] for line in inner_steps])), 5),
+        }
+    results[run.name] = {"training": training}
     for name in REPORTS:
         path = Path(f"{run}-{name}") / "success.json"
-        if path.exists():
-            report = json.loads(path.read_text())
-            for part in [name for name in ("successes", "checkpoints") if name in report]:
+        if not path.exists():
+            continue
+        report = json.loads(path.read_text())
+        for part in ("successes", "checkpoints"):
+            if part in report:
                 report[part] = {
-                    column: {task: "".join(str(int(s)) for s in e) for task, e in tasks.items()}
-                    for column, tasks in report[part].items()
+                    title: {task: as_digits(episodes) for task, episodes in column.items()}
+                    for title, column in report[part].items()
                 }
-            results[run.name][name] = report
+        results[run.name][name] = report
 
 
-def runs_of(results: dict, variant: str) -> list[dict]:
+def as_digits(episodes: Sequence[bool]) -> str:
+    """`[True, False]` -> "10"."""
+    return "".join(str(int(success)) for success in episodes)
+
+
+# ---- What RESULTS.json holds ---------------------------------------------------------------------
+
+
+def runs_of(results: Results, variant: str) -> list[dict]:
     """The runs of a variant, one a seed."""
     return [run for name, run in sorted(results.items()) if name.rsplit("-seed")[0] == variant]
 
 
-def measured(run: dict, report: str, column: int | str = 0) -> Successes | None:
-    """The episodes in a column (its name, or its place) of a run's report, if there is one."""
-    columns = run.get(report, {}).get("successes", {})
-    if isinstance(column, int):
-        column = list(columns)[column] if columns else ""
-    if column not in columns:
+def measured(run: dict, column: Column) -> Successes | None:
+    """The episodes in a column of a run's report, if there is one."""
+    columns = run.get(column.report, {}).get("successes", {})
+    title = column.column
+    if isinstance(title, int):
+        if not columns:
+            return None
+        title = list(columns)[title]
+    if title not in columns:
         return None
-    return {task: [c == "1" for c in episodes] for task, episodes in columns[column].items()}
+    return {task: [c == "1" for c in episodes] for task, episodes in columns[title].items()}
 
 
-def on_all_goals(run: dict, report: str, column: int | str = 0) -> Successes | None:
+def on_all_goals(run: dict, column: Column) -> Successes | None:
     """The same with the episodes of the report on other goals behind them, if there is one."""
-    first, again = (measured(run, name, column) for name in (report, report + AGAIN))
-    return {task: first[task] + again[task] for task in first} if first and again else first
+    first = measured(run, column)
+    again = measured(run, replace(column, report=column.report + AGAIN))
+    if first is None or again is None:
+        return first
+    return {task: first[task] + again[task] for task in first}
 
 
-def mean(results: dict, variant: str, report: str, column: int | str = 0) -> str:
+def mean(results: Results, variant: str, column: Column) -> str:
     """The mean over tasks: Student's interval over several seeds, Wilson's over one's episodes."""
-    found = [on_all_goals(run, report, column) for run in runs_of(results, variant)]
-    found = [successes for successes in found if successes]
-    if not found:
+    of_runs = [on_all_goals(run, column) for run in runs_of(results, variant)]
+    of_runs = [successes for successes in of_runs if successes]
+    if not of_runs:
         return ""
-    if len(found) > 1:
-        return mean_interval([mean_success(successes) for successes in found])
-    return f"{pooled_success(found[0])} (one run)"
+    if len(of_runs) == 1:
+        return f"{pooled_success(of_runs[0])} (one run)"
+    return mean_interval([mean_success(successes) for successes in of_runs])
 
 
-def papers(suite: str, split: str, tasks: list[str]) -> list[str]:
-    """The paper's success of DP3 and of DAMI, the mean over some tasks."""
-    theirs = PAPER[suite][split]
-    return [f"{np.mean([theirs[t][name] for t in tasks]):.1f}" for name in ("DP3", "DAMI")]
+def together(
+    results: Results, variant: str, column: Column, tasks: Sequence[str] | None = None
+) -> list[bool]:
+    """The episodes of some tasks, or of all, and of all of a variant's seeds together."""
+    episodes = []
+    for run in runs_of(results, variant):
+        successes = on_all_goals(run, column) or {}
+        for task in tasks or successes:
+            episodes += successes.get(task, [])
+    return episodes
+
+
+def pooled(results: Results, variant: str, column: Column, tasks: Sequence[str]) -> str:
+    """The share of successes in some tasks, of all of a variant's seeds together."""
+    episodes = together(results, variant, column, tasks)
+    return format_success(sum(episodes), len(episodes)) if episodes else ""
+
+
+# ---- Tables --------------------------------------------------------------------------------------
+
+
+def paper_mean(suite: str, split: str, policy: str, tasks: Sequence[str] | None = None) -> str:
+    """The mean of what the paper has of a policy on some tasks of a split, or on all."""
+    rates = PAPER[suite][split]
+    return f"{np.mean([rates[task][policy] for task in tasks or TASKS[suite][split]]):.1f}"
+
+
+def paper_cells(suite: str, split: str, tasks: Sequence[str] | None = None) -> list[str]:
+    """That of DP3 and of DAMI."""
+    return [paper_mean(suite, split, policy, tasks) for policy in ("DP3", "DAMI")]
 
 
 def head(suite: str, title: str) -> list[str]:
@@ -191,108 +261,110 @@ def head(suite: str, title: str) -> list[str]:
     return [title, *SHOWN[suite].values(), "paper, DP3", "paper, DAMI"]
 
 
-def means_table(results: dict, suite: str = "ml10") -> str:
-    """The means of DAMI, without its inner loop, of multi-task training, and the paper's."""
-    tasks = TASKS[suite]
-    rows = [
-        ["base tasks", REPORT["base"], papers(suite, "base", tasks["base"])],
-        ["novel tasks, no gradient step", ("novel", "before"), ["", ""]],
-        ["novel tasks, 200 steps", REPORT["novel"], papers(suite, "novel", tasks["novel"])],
-    ]
-    shown = SHOWN[suite]
-    rows = [[t, *(mean(results, v, *report) for v in shown), *theirs] for t, report, theirs in rows]
-    return format_table([head(suite, suite.upper()), *rows])
+def means_table(results: Results, suite: str = "ml10") -> str:
+    """The means of each variant that is shown, and the paper's."""
+
+    def row(title: str, column: Column, paper: list[str]) -> list[str]:
+        return [title, *(mean(results, variant, column) for variant in SHOWN[suite]), *paper]
+
+    return format_table(
+        [
+            head(suite, suite.upper()),
+            row("base tasks", BASE, paper_cells(suite, "base")),
+            row("novel tasks, no gradient step", BEFORE, ["", ""]),
+            row("novel tasks, 200 steps", AFTER, paper_cells(suite, "novel")),
+        ]
+    )
 
 
-def by_task_table(split: str, suite: str = "ml10") -> Callable[[dict], str]:
+def by_task_table(results: Results, split: str, suite: str = "ml10") -> str:
     """A row a task: each variant's seeds together, and the paper's."""
-
-    def make(results: dict) -> str:
-        rows, tasks, shown = [], TASKS[suite][split], SHOWN[suite]
-        for task in tasks:
-            cells = [pooled(results, variant, REPORT[split], [task]) for variant in shown]
-            rows.append([task, *cells, *papers(suite, split, [task])])
-        means = [mean(results, variant, *REPORT[split]) for variant in shown]
-        rows.append(["**mean**", *means, *papers(suite, split, tasks)])
-        return format_table([head(suite, "task"), *rows])
-
-    return make
+    column = MEASURED_BY[split]
+    rows = [head(suite, "task")]
+    for task in TASKS[suite][split]:
+        cells = [pooled(results, variant, column, [task]) for variant in SHOWN[suite]]
+        rows.append([task, *cells, *paper_cells(suite, split, [task])])
+    means = [mean(results, variant, column) for variant in SHOWN[suite]]
+    rows.append(["**mean**", *means, *paper_cells(suite, split)])
+    return format_table(rows)
 
 
-def together(
-    results: dict, variant: str, report: tuple[str, int | str], tasks: list[str] | None = None
-) -> list[bool]:
-    """The episodes of some tasks, or all, and of all of a variant's seeds together."""
-    found = [on_all_goals(run, *report) or {} for run in runs_of(results, variant)]
+def difficulty_table(results: Results, suite: str = "ml10") -> str:
+    """A row for the base tasks, and one for the novel tasks, of each difficulty."""
+    difficulty_of = {task: name for name, tasks in DIFFICULTY.items() for task in tasks.split()}
+    rows = [head(suite, "tasks")]
+    for split, column in MEASURED_BY.items():
+        for difficulty in ("easy", *DIFFICULTY):
+            tasks = [t for t in TASKS[suite][split] if difficulty_of.get(t, "easy") == difficulty]
+            if tasks:
+                cells = [pooled(results, variant, column, tasks) for variant in SHOWN[suite]]
+                title = f"{split}, {difficulty} ({len(tasks)})"
+                rows.append([title, *cells, *paper_cells(suite, split, tasks)])
+    return format_table(rows)
+
+
+def variants_table(results: Results) -> str:
+    """What decides: a row a variant of ML10; ML45 has a table of its own."""
+    rows = [["ML10", "base", "novel, no gradient step", "novel, 200 steps"]]
+    for variant, title in VARIANTS.items():
+        cells = [mean(results, variant, column) for column in (BASE, BEFORE, AFTER)]
+        if any(cells) and not variant.startswith("ml45"):
+            rows.append([title, *cells])
+    return format_table(rows)
+
+
+def policies_table(results: Results) -> str:
+    """The paper's policies, without and with meta-training, beside what the paper has of them."""
+    rows = [
+        [
+            "ML10",
+            "base",
+            "base + MAML",
+            "novel",
+            "novel + MAML",
+            "paper, base, without / with",
+            "paper, novel, without / with",
+        ]
+    ]
+    of_dami = [f"- / {paper_mean('ml10', split, 'DAMI')}" for split in ("base", "novel")]
+    rows.append(["DAMI", *with_and_without(results, "ml10-no-inner-loop", "ml10-dami"), *of_dami])
+    for policy, name in POLICIES.items():
+        ours = with_and_without(results, f"ml10-{policy}", f"ml10-{policy}-maml")
+        paper = []
+        for split, table in (("base", "base_maml_avg"), ("novel", "novel_maml")):
+            with_maml = np.mean(PAPER["ml10"][table][name])
+            paper.append(f"{paper_mean('ml10', split, name)} / {with_maml:.1f}")
+        rows.append([name, *ours, *paper])
+    return format_table(rows)
+
+
+def with_and_without(results: Results, plain: str, meta_trained: str) -> list[str]:
+    """The means of a variant without and one with meta-training, on base and on novel tasks."""
     return [
-        s for successes in found for task in tasks or successes for s in successes.get(task, [])
+        mean(results, variant, column)
+        for column in (BASE, AFTER)
+        for variant in (plain, meta_trained)
     ]
 
 
-def pooled(results: dict, variant: str, report: tuple[str, int | str], tasks: list[str]) -> str:
-    """The share of successes in some tasks, of all of a variant's seeds together."""
-    episodes = together(results, variant, report, tasks)
-    return format_success(sum(episodes), len(episodes)) if episodes else ""
-
-
-def difficulty_table(results: dict, suite: str = "ml10") -> str:
-    """A row for the base tasks, and one for the novel tasks, of each difficulty."""
-    rows, of = [], {task: name for name, tasks in DIFFICULTY.items() for task in tasks.split()}
-    for split, report in REPORT.items():
-        for difficulty in ("easy", *DIFFICULTY):
-            tasks = [t for t in TASKS[suite][split] if of.get(t, "easy") == difficulty]
-            if tasks:
-                cells = [pooled(results, variant, report, tasks) for variant in SHOWN[suite]]
-                title = f"{split}, {difficulty} ({len(tasks)})"
-                rows.append([title, *cells, *papers(suite, split, tasks)])
-    return format_table([head(suite, "tasks"), *rows])
-
-
-def variants_table(results: dict) -> str:
-    """What decides: a row a variant."""
-    rows = []
-    for variant, title in VARIANTS.items():
-        columns = REPORT["base"], ("novel", "before"), REPORT["novel"]
-        cells = [mean(results, variant, *column) for column in columns]
-        if any(cells) and not variant.startswith("ml45"):  # it has a table of its own
-            rows.append([title, *cells])
-    return format_table([["ML10", "base", "novel, no gradient step", "novel, 200 steps"], *rows])
-
-
-def policies_table(results: dict) -> str:
-    """The paper's policies, without and with meta-training, beside what the paper has of them."""
-    rows = [["ML10", *(f"{split}{how}" for split in REPORT for how in ("", " + MAML"))]]
-    rows[0] += [f"paper, {split}, without / with" for split in REPORT]
-    ours = {f"ml10-{key}": (f"ml10-{key}-maml", name) for key, name in POLICIES.items()}
-    for plain, (meta, name) in ({"ml10-no-inner-loop": ("ml10-dami", "DAMI")} | ours).items():
-        row = [mean(results, v, *column) for column in REPORT.values() for v in (plain, meta)]
-        for split, tasks in TASKS["ml10"].items():
-            theirs = f"{np.mean([PAPER['ml10'][split][t][name] for t in tasks]):.1f}"
-            if name == "DAMI":
-                row.append(f"- / {theirs}")
-            else:
-                maml = PAPER["ml10"]["base_maml_avg" if split == "base" else "novel_maml"][name]
-                row.append(f"{theirs} / {np.mean(maml):.1f}")
-        rows.append([name, *row])
-    return format_table(rows)
-
-
-def ablation_table(results: dict) -> str:
+def ablation_table(results: Results) -> str:
     """The rows of the paper's ablation, each with its mean there."""
-    rows = [["ML10, without the inner loop", *REPORT, "paper, novel"]]
-    for row, (variant, title) in ABLATION.items():
-        cells = [mean(results, f"ml10-{variant}", *report) for report in REPORT.values()]
-        rows.append([title, *cells, f"{np.mean(PAPER['ml10']['novel_ablation'][row]):.1f}"])
+    rows = [["ML10, without the inner loop", "base", "novel", "paper, novel"]]
+    for name, (variant, title) in ABLATION.items():
+        cells = [mean(results, f"ml10-{variant}", column) for column in (BASE, AFTER)]
+        rows.append([title, *cells, f"{np.mean(PAPER['ml10']['novel_ablation'][name]):.1f}"])
     return format_table(rows)
 
 
-def length_table(results: dict) -> str:
+def length_table(results: Results) -> str:
     """A row a checkpoint of the run whose checkpoints were all measured."""
     rows = [["outer steps", "minutes", "base tasks"]]
     for run in results.values():
+        training = run["training"]
         for label, tasks in run.get("top", {}).get("checkpoints", {}).items():
-            step, whole = int(label[-5:]), run["training"]["arguments"]["steps"]
-            minutes, episodes = run["training"]["minutes"] * step / whole, "".join(tasks.values())
+            step = int(label[-5:])
+            minutes = training["minutes"] * step / training["arguments"]["steps"]
+            episodes = "".join(tasks.values())
             success = format_success(episodes.count("1"), len(episodes))
             rows.append([str(step), f"{minutes:.0f}", success])
     return format_table(rows)
@@ -303,94 +375,102 @@ def pairs(one: Successes, other: Successes) -> list[tuple[bool, bool]]:
     return [pair for task in one for pair in zip(one[task], other[task])]
 
 
-def limits_table(titles: dict[str, str], first: str) -> Callable[[dict], str]:
-    """A row a variant of `titles`, seed 0 of each, beside the first: on goals of no result."""
+def limits_table(results: Results, titles: dict[str, str], first: str) -> str:
+    """A row a variant of `titles`, seed 0 of each, beside the first of them.
 
-    def make(results: dict) -> str:
-        rows = [[first, "base tasks", "won, lost against the first"]]
-        found = {v: measured(results.get(f"ml10-{v}-seed0", {}), "limits") for v in titles}
-        plain = found[next(iter(titles))]
-        for variant, successes in found.items():
-            if successes:
-                outcomes = pairs(successes, plain)
-                counts = f"{outcomes.count((True, False))}, {outcomes.count((False, True))}"
-                against = counts if successes is not plain else ""
-                rows.append([titles[variant], pooled_success(successes), against])
-        return format_table(rows)
+    They are measured on goals that no other result has. `first` is the title of the first column.
+    """
+    successes = {
+        variant: measured(results.get(f"ml10-{variant}-seed0", {}), Column("limits"))
+        for variant in titles
+    }
+    plain = successes[next(iter(titles))]
+    rows = [[first, "base tasks", "won, lost against the first"]]
+    for variant, of_variant in successes.items():
+        if of_variant is None:
+            continue
+        outcomes = pairs(of_variant, plain)
+        counts = f"{outcomes.count((True, False))}, {outcomes.count((False, True))}"
+        against = "" if of_variant is plain else counts
+        rows.append([titles[variant], pooled_success(of_variant), against])
+    return format_table(rows)
 
-    return make
+
+SWAP_COLUMNS = {  # what a policy is shown -> where that was measured
+    "instruction, own demonstration": Column("told", 0),
+    "instruction, another's demonstration": Column("told", 1),
+    "another's instruction, own demonstration": Column("told", 2),
+    "own demonstration alone": Column("swap", 0),
+    "another's demonstration alone": Column("swap", 1),
+}
 
 
-def swaps(results: dict) -> dict[str, list[tuple[str, Successes]]]:
-    """Policy -> what it is shown, and its episodes on the base tasks."""
-    found = {}
+def swaps(results: Results) -> dict[str, dict[str, Successes]]:
+    """Policy -> what it is shown -> its episodes on the base tasks."""
+    policies = {}
     for name, title in SWAPPED.items():
-        run = results.get(name, {})
-        shown = [
-            ("instruction, own demonstration", measured(run, "told", 0)),
-            ("instruction, another's demonstration", measured(run, "told", 1)),
-            ("another's instruction, own demonstration", measured(run, "told", 2)),
-            ("own demonstration alone", measured(run, "swap", 0)),
-            ("another's demonstration alone", measured(run, "swap", 1)),
-        ]
-        found[title] = [(label, successes) for label, successes in shown if successes]
-    return found
+        columns = {
+            label: measured(results.get(name, {}), column) for label, column in SWAP_COLUMNS.items()
+        }
+        policies[title] = {label: x for label, x in columns.items() if x is not None}
+    return policies
 
 
-def reading_table(results: dict) -> str:
+def swap_table(results: Results) -> str:
+    """A row for each thing that a policy can be shown, a column a policy."""
+    policies = swaps(results)
+    rows = [["what the policy sees", *policies]]
+    for label in SWAP_COLUMNS:
+        if any(label in columns for columns in policies.values()):
+            cells = [pooled_success(c[label]) if label in c else "" for c in policies.values()]
+            rows.append([label, *cells])
+    return format_table(rows)
+
+
+def reading_table(results: Results) -> str:
     """A row a run that is told nothing: success with its own demonstration, with another task's."""
     rows = [["run", "own demonstration alone", "another's demonstration alone"]]
     for variant, title in VARIANTS.items():
         for run in runs_of(results, variant):
             if "swap" in run:
-                cells = [pooled_success(measured(run, "swap", column)) for column in (0, 1)]
+                cells = [pooled_success(measured(run, Column("swap", place))) for place in (0, 1)]
                 rows.append([f"{title}, seed {run['training']['arguments']['seed']}", *cells])
     return format_table(rows)
 
 
-def looks_table(results: dict) -> str:
+def looks_table(results: Results) -> str:
     """A row a run that was also rolled out with eight actions of ten steps for four of five."""
-    columns = REPORT.values()
-    rows = [["run", *(f"{split}, {n}" for split in REPORT for n in ("8 of 10", "4 of 5"))]]
+    rows = [["run", "base, 8 of 10", "base, 4 of 5", "novel, 8 of 10", "novel, 4 of 5"]]
     for name, run in sorted(results.items()):
-        before = results.get(name.replace("-seed", "-eight-seed"))
-        if before and "base" in before and before["training"] == run["training"]:
-            cells = [pooled_success(measured(r, *c)) for c in columns for r in (before, run)]
-            rows.append([f"{VARIANTS[name.rsplit('-seed')[0]]}, seed {name[-1]}", *cells])
+        eight = results.get(name.replace("-seed", "-eight-seed"))
+        if eight is None or "base" not in eight or eight["training"] != run["training"]:
+            continue
+        cells = [pooled_success(measured(r, c)) for c in (BASE, AFTER) for r in (eight, run)]
+        rows.append([f"{VARIANTS[name.rsplit('-seed')[0]]}, seed {name[-1]}", *cells])
     return format_table(rows)
 
 
-def swap_table(results: dict) -> str:
-    rows = {}
-    policies = swaps(results)
-    for title, shown in policies.items():
-        for label, successes in shown:
-            rows.setdefault(label, {})[title] = pooled_success(successes)
-    cells = [[label, *(by.get(title, "") for title in policies)] for label, by in rows.items()]
-    return format_table([["what the policy sees", *policies], *cells])
-
-
-TABLES = {
+TABLES: dict[str, Callable[[Results], str]] = {
     "means": means_table,
-    "base": by_task_table("base"),
-    "novel": by_task_table("novel"),
+    "base": lambda results: by_task_table(results, "base"),
+    "novel": lambda results: by_task_table(results, "novel"),
     "difficulty": difficulty_table,
     "variants": variants_table,
     "policies": policies_table,
     "ablation": ablation_table,
     "length": length_table,
-    "limits": limits_table(LIMITS, "given"),
-    "tuning": limits_table(TUNING, "trained"),
+    "limits": lambda results: limits_table(results, LIMITS, "given"),
+    "tuning": lambda results: limits_table(results, TUNING, "trained"),
     "ml45 means": lambda results: means_table(results, "ml45"),
     "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),
-    "ml45 novel": by_task_table("novel", "ml45"),
+    "ml45 novel": lambda results: by_task_table(results, "novel", "ml45"),
     "looks": looks_table,
     "swap": swap_table,
     "reading": reading_table,
 }
 
 
-def fill(text: str, results: dict) -> str:
+def fill(text: str, results: Results) -> str:
     """README or RESULTS.md with each table between its two comments as RESULTS.json has it."""
     for name, make in TABLES.items():
         pattern = rf"(<!-- results: {name} -->\n).*?(<!-- end -->)"
@@ -399,125 +479,176 @@ def fill(text: str, results: dict) -> str:
     return text
 
 
-def draw_swap(results: dict, path: Path) -> None:
-    """A bar for each thing that a policy can be shown: is the demonstration read?"""
+# ---- Charts --------------------------------------------------------------------------------------
+
+
+def plot_swap(results: Results, path: Path) -> None:
+    """Writes a chart with a bar for each thing that a policy can be shown, a panel a policy."""
     from matplotlib.figure import Figure
 
-    policies = {title: dict(shown) for title, shown in swaps(results).items() if shown}
+    policies = {title: columns for title, columns in swaps(results).items() if columns}
     labels = list(max(policies.values(), key=len))
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(policies), sharey=True))
-    for axes, (title, shown) in zip(panels, policies.items()):
-        for label, successes in shown.items():
-            episodes = [s for task in successes.values() for s in task]
+    for axes, (title, columns) in zip(panels, policies.items()):
+        for place, label in enumerate(labels):
+            if label not in columns:
+                axes.text(3, place, "not measured", va="center", fontsize=8)
+                continue
+            episodes = [success for of_task in columns[label].values() for success in of_task]
             rate, bounds = np.mean(episodes), wilson_interval(sum(episodes), len(episodes))
-            error = 100 * np.abs(np.array(bounds)[:, None] - rate)
+            error = 100 * np.abs(np.array(bounds)[:, None] - rate)  # (2, 1)
             color = "C3" if "another" in label else "C0"
-            axes.barh(labels.index(label), 100 * rate, xerr=error, color=color, capsize=2)
-        for label in set(labels) - set(shown):
-            axes.text(3, labels.index(label), "not measured", va="center", fontsize=8)
+            axes.barh(place, 100 * rate, xerr=error, color=color, capsize=2)
         axes.set_yticks(range(len(labels)), labels, fontsize=8)
         axes.set(xlabel="success, %", xlim=(0, 100), ylim=(len(labels) - 0.4, -0.6))
         axes.set_title(title, fontsize=10)
         axes.spines[["top", "right"]].set_visible(False)
-    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
+    save_png(figure, path, dpi=120)
 
 
-def draw_adaptation(results: dict, path: Path) -> None:
-    """Success on novel tasks against gradient steps, and against the number of demonstrations."""
+GRADIENT_STEPS = {  # with ten demonstrations -> where that was measured
+    0: Column("curve", "before"),
+    1: Column("curve", "1 steps"),
+    5: Column("curve", "5 steps"),
+    20: Column("curve", "20 steps"),
+    50: Column("curve", "50 steps"),
+    200: Column("curve", "after"),
+    500: Column("long", "500 steps"),
+    1000: Column("long", "after"),
+}
+DEMONSTRATIONS = {  # with 200 gradient steps -> where that was measured
+    1: Column("1-shot", "after"),
+    3: Column("3-shot", "after"),
+    5: Column("5-shot", "after"),
+    10: Column("curve", "after"),
+}
+
+
+def plot_adaptation(results: Results, path: Path) -> None:
+    """Writes a chart of success on novel tasks along gradient steps, and along demonstrations."""
     from matplotlib.figure import Figure
 
-    shots = [(n, f"{n}-shot", "after") for n in (1, 3, 5)] + [(10, "curve", "after")]
-    steps = [(0, "curve", "before"), *((n, "curve", f"{n} steps") for n in (1, 5, 20, 50))]
-    steps += [(200, "curve", "after"), (500, "long", "500 steps"), (1000, "long", "after")]
-    panels = {"gradient steps, ten demonstrations": steps}
-    panels["demonstrations, 200 gradient steps"] = shots
+    panels = {
+        "gradient steps, ten demonstrations": GRADIENT_STEPS,
+        "demonstrations, 200 gradient steps": DEMONSTRATIONS,
+    }
     figure = Figure(figsize=(10, 3.8), layout="constrained")
-    for axes, (label, points) in zip(figure.subplots(1, 2, sharey=True), panels.items()):
+    for axes, (label, columns) in zip(figure.subplots(1, 2, sharey=True), panels.items()):
         for variant, title in VARIANTS.items():
-            curve = [(x, together(results, variant, report)) for x, *report in points]
-            if not (curve := [(x, episodes) for x, episodes in curve if episodes]):
+            episodes = {x: together(results, variant, column) for x, column in columns.items()}
+            episodes = {x: of_column for x, of_column in episodes.items() if of_column}
+            if not episodes:
                 continue
-            bounds = [wilson_interval(sum(e), len(e)) for _, e in curve]
-            rates = np.array([np.mean(e) for _, e in curve])
-            error = 100 * np.abs(np.array(bounds).T - rates)  # (2, points)
-            line = {"marker": "o", "markersize": 4, "capsize": 2, "linewidth": 1.5}
-            line["label"] = SHOWN["ml10"].get(variant, title)
-            axes.errorbar([x for x, _ in curve], 100 * rates, error, **line)
+            bounds = [wilson_interval(sum(e), len(e)) for e in episodes.values()]
+            rates = np.array([np.mean(e) for e in episodes.values()])
+            axes.errorbar(
+                list(episodes),
+                100 * rates,
+                yerr=100 * np.abs(np.array(bounds).T - rates),  # (2, points)
+                label=SHOWN["ml10"].get(variant, title),
+                marker="o",
+                markersize=4,
+                capsize=2,
+                linewidth=1.5,
+            )
         axes.set_xscale("symlog", linthresh=1)
-        axes.set_xticks([x for x, *_ in points], [x for x, *_ in points], fontsize=7)
+        axes.set_xticks(list(columns), list(columns), fontsize=7)
         axes.minorticks_off()
         axes.set(xlabel=label, ylim=(0, 100))
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel("success on novel tasks, %")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, ncols=2, loc="outside upper center", fontsize=8)
-    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
+    save_png(figure, path, dpi=120)
 
 
-def draw_by_task(results: dict, path: Path) -> None:
-    """Success by task, of all seeds together, beside the paper's."""
+def plot_by_task(results: Results, path: Path) -> None:
+    """Writes a chart of success by task, of all seeds together, beside the paper's."""
     columns: dict[str, Successes] = {}
     for variant, label in SHOWN["ml10"].items():
-        columns[label] = {task: [] for tasks in TASKS["ml10"].values() for task in tasks}
-        for run in runs_of(results, variant):
-            for report in REPORT.values():
-                for task, successes in on_all_goals(run, *report).items():
-                    columns[label][task] += successes
+        columns[label] = {
+            task: together(results, variant, column, [task])
+            for split, column in MEASURED_BY.items()
+            for task in TASKS["ml10"][split]
+        }
     title = "base tasks directly, novel tasks (the last five) after 200 steps"
-    draw_success(columns, path, title, "ml10")
+    plot_success(columns, path, title, paper_columns("ml10", ["dami"]))
 
 
-def compare(results: dict, one: str, other: str) -> str:
+# ---- Comparing, and shipping ---------------------------------------------------------------------
+
+
+def compare(results: Results, one: str, other: str) -> str:
     """Episodes on the same goals that one variant wins and loses against another, seed by seed.
 
     A row a report that both have, of its column "after" or else its first; p: two-sided sign test.
     """
+
+    def episodes_of(run: dict, report: str) -> Successes | None:
+        after = on_all_goals(run, Column(report, "after"))
+        return after or on_all_goals(run, Column(report))
+
     rows = [["report", "won", "lost", "episodes", "p"]]
     names = [name for name in results if name.startswith(f"{one}-seed")]
-    both = [(results[name], results.get(name.replace(one, other, 1), {})) for name in names]
-    for name in (name for name in REPORTS if not name.endswith(AGAIN)):
+    for report in REPORTS:
+        if report.endswith(AGAIN):  # these episodes are counted with those of the report itself
+            continue
         outcomes = []
-        for pair in both:
-            columns = [on_all_goals(r, name, "after") or on_all_goals(r, name) for r in pair]
-            if all(columns):
-                outcomes += pairs(*columns)
+        for name in names:
+            ours = episodes_of(results[name], report)
+            theirs = episodes_of(results.get(name.replace(one, other, 1), {}), report)
+            if ours and theirs:
+                outcomes += pairs(ours, theirs)
         if outcomes:
             won, lost = outcomes.count((True, False)), outcomes.count((False, True))
             p = binomtest(won, won + lost).pvalue if won + lost else 1.0
-            rows.append([name, str(won), str(lost), str(len(outcomes)), f"{p:.4f}"])
+            rows.append([report, str(won), str(lost), str(len(outcomes)), f"{p:.4f}"])
     return format_table(rows)
 
 
 def ship(checkpoint: str) -> None:
     """Writes assets/ml10-small.pt: a checkpoint in float16 that is rolled out as `small` is."""
-    small = asdict(PRESETS["small"])
-    changed = {name: small[name] for name in ("n_action_steps", "inference_steps")}
-    policy, info = load_checkpoint(checkpoint, **changed)
+    small = model.PRESETS["small"]
+    policy, info = load_trained(
+        checkpoint, n_action_steps=small.n_action_steps, inference_steps=small.inference_steps
+    )
     kept = {name: info[name] for name in TRAINED}
-    save_checkpoint(SHIPPED_CHECKPOINT, policy, half=True, **kept)
+    model.save(SHIPPED_CHECKPOINT, policy, half=True, **kept)
 
 
-def main(words: list[str]) -> None:
-    if words[:1] == ["--ship"]:
-        return ship(words[1])
-    results = json.loads(RESULTS.read_text())
-    if words[:1] == ["--compare"]:
-        return print(compare(results, *words[1:]))
-    for folder in words:
-        take(results, Path(folder))
-    if words:
-        text = json.dumps(results, indent=1) + "\n"
-        write_atomically(RESULTS, lambda path: path.write_text(text))
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    add = parser.add_argument
+    add("runs", nargs="*", help="folders of tests.runs to take into RESULTS.json")
+    add("--compare", nargs=2, metavar="VARIANT", help="episodes that the first wins and loses")
+    add("--ship", metavar="CHECKPOINT", help="make it assets/ml10-small.pt")
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(argv)
+    if args.ship:
+        ship(args.ship)
         return
+    results = json.loads(RESULTS.read_text())
+    if args.compare:
+        one, other = args.compare
+        print(compare(results, one, other))
+        return
+    if args.runs:
+        for folder in args.runs:
+            take(results, Path(folder))
+        write_text(RESULTS, json.dumps(results, indent=1) + "\n")
+        return
+
     for name in ("README.md", "RESULTS.md"):
-        filled = fill((ROOT / name).read_text(), results)
-        write_atomically(ROOT / name, lambda path, filled=filled: path.write_text(filled))
-    draw_swap(results, ROOT / "assets" / "swap.png")
-    draw_by_task(results, ROOT / "assets" / "success.png")
+        write_text(ROOT / name, fill((ROOT / name).read_text(), results))
+    plot_swap(results, ROOT / "assets" / "swap.png")
+    plot_by_task(results, ROOT / "assets" / "success.png")
     if any("curve" in run for run in results.values()):
-        draw_adaptation(results, ROOT / "assets" / "adaptation.png")
+        plot_adaptation(results, ROOT / "assets" / "adaptation.png")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command_line(main, errors=(CheckpointError,))

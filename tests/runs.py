@@ -15,79 +15,94 @@ import re
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from common import choose, command_line
 from tests.oracle import WORLDS
 
-VARIANTS = {
+NEITHER = "--demo-encoder none --maml off"  # multi-task training
+METHOD = {  # a variant of the method -> its flags of train.py
     "dami": "",
     "no-inner-loop": "--maml off",
     "no-demonstration": "--demo-encoder none",
-    "neither": "--demo-encoder none --maml off",
-    "twice-as-long": "--demo-encoder none --maml off --steps 20000",
+    "neither": NEITHER,
+    "twice-as-long": f"{NEITHER} --steps 20000",
     "first-order": "--maml first",
     "first-order-3e-2": "--maml first --inner-lr 3e-2",
     "inner-3e-2": "--inner-lr 3e-2",
     "no-dropout": "--instruction-dropout 0",
     "more-dropout": "--instruction-dropout 0.5",
-    "no-support-only": "--support-only 0",
+    "no-task-dropout": "--task-dropout 0",
     "mlp": "--demo-encoder mlp --maml off",
     "mid": "--tcfm mid --maml off",
     "up": "--tcfm up --maml off",
     "baseline": "--demo-encoder mlp --tcfm none --maml off",
     "vmt": "--tcfm none --maml off",
     "scratch": "--maml off --warmup 10000 --steps 1",  # at a rate of 1e-7: a policy of chance
+    "dp3": "--policy dp3 --maml off",
+    "flow": "--policy flow --maml off",
+    "mamba": "--policy mamba --maml off",
+    "freq": "--policy freq --maml off",
+    "dp3-maml": "--policy dp3",
+    "flow-maml": "--policy flow",
+    "mamba-maml": "--policy mamba",
+    "freq-maml": "--policy freq",
 }
-VARIANTS |= {policy: f"--policy {policy} --maml off" for policy in ("dp3", "flow", "mamba", "freq")}
-VARIANTS |= {f"{policy}-maml": f"--policy {policy}" for policy in ("dp3", "flow", "mamba", "freq")}
 LIMITS = {  # what more or less of something would buy; measured on base tasks alone
-    "30-demonstrations": "--demonstrations 30 --data data30",
-    "100-demonstrations": "--demonstrations 100 --data data100",
-    "points-64": "--num-points 64",
-    "points-256": "--num-points 256",
-    "unmoved": "--no-augment",
-    "positions": "--data data-positions",
-    "pixels": "--data data-pixels",
+    "30-demonstrations": f"{NEITHER} --demonstrations 30 --data data30",
+    "100-demonstrations": f"{NEITHER} --demonstrations 100 --data data100",
+    "points-64": f"{NEITHER} --num-points 64",
+    "points-256": f"{NEITHER} --num-points 256",
+    "unmoved": f"{NEITHER} --no-augment",
+    "positions": f"{NEITHER} --data data-positions",
+    "pixels": f"{NEITHER} --data data-pixels",
 }
-SHORT = f"{VARIANTS['neither']} --steps 4000"
+SHORT = f"{NEITHER} --steps 4000"
 TUNING = {  # two fifths of the steps, or as many windows; measured as LIMITS are
-    "4000-steps": "",
-    "lr-5e-4": "--lr 5e-4",
-    "lr-2e-3": "--lr 2e-3",
-    "batch-8": "--support 2 --query 6 --steps 8000",
-    "batch-32": "--support 8 --query 24 --steps 2000",
-    "not-augmented": "--no-augment",
-    "augmented-twice": "",
-    "not-averaged": "",
+    "4000-steps": SHORT,
+    "lr-5e-4": f"{SHORT} --lr 5e-4",
+    "lr-2e-3": f"{SHORT} --lr 2e-3",
+    "batch-8": f"{SHORT} --support 2 --query 6 --steps 8000",
+    "batch-32": f"{SHORT} --support 8 --query 24 --steps 2000",
+    "not-augmented": f"{SHORT} --no-augment",
+    "augmented-twice": SHORT,  # in a world of tests.oracle, as are "not-averaged", "positions" ...
+    "not-averaged": SHORT,
 }
-VARIANTS |= {name: f"{VARIANTS['neither']} {flags}" for name, flags in LIMITS.items()}
-VARIANTS |= {name: f"{SHORT} {flags}" for name, flags in TUNING.items()}
+VARIANTS = {**METHOD, **LIMITS, **TUNING}
 
 SEED = 1  # of the evaluation's goals: that of no training, and of no choice that was made
 EPISODES = 50
+AGAIN = "-goals2"  # the same report on 50 other goals
+
+EVERY = tuple(METHOD)
 READS = ("dami", "no-inner-loop")  # a demonstration: may go without the instruction
-LONGER = ("neither", "twice-as-long")
 DECIDE = (*READS, "no-demonstration", "neither")
 SHOWN = (*READS, "neither", "scratch")
-REPORTED = [name for name in VARIANTS if name not in LIMITS | TUNING]
-REPORTS = {  # name -> command, of which variants, (): of REPORTED; {run} is the run's folder
-    "base": ("evaluate.py --checkpoint {run}", ()),
-    "novel": ("finetune.py --task novel --checkpoint {run}", ()),
+LONGER = ("neither", "twice-as-long")
+REPORTS = {  # name -> command, and the variants that it measures; {run} is a run's folder
+    "base": ("evaluate.py --checkpoint {run}", EVERY),
+    "novel": ("finetune.py --task novel --checkpoint {run}", EVERY),
     "told": ("evaluate.py --checkpoint {run} --swap demonstration instruction", READS),
     "swap": ("evaluate.py --checkpoint {run} --without instruction --swap demonstration", READS),
     "one-shot": ("evaluate.py --checkpoint {run} --split novel --without instruction", READS),
     "top": ("evaluate.py --checkpoint {run} --top 5 --episodes 20", ("neither",)),
     "alone": ("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
+    f"base{AGAIN}": ("evaluate.py --checkpoint {run} --seed 2", DECIDE),
+    f"novel{AGAIN}": ("finetune.py --task novel --checkpoint {run} --seed 2", DECIDE),
+    "limits": ("evaluate.py --checkpoint {run} --seed 10", (*LONGER, *LIMITS, *TUNING)),
 }
-AGAIN = "-goals2"  # the same report on 50 other goals
-REPORTS |= {name + AGAIN: (f"{REPORTS[name][0]} --seed 2", DECIDE) for name in ("base", "novel")}
-REPORTS["limits"] = (f"{REPORTS['base'][0]} --seed 10", (*LONGER, *LIMITS, *TUNING))
-# Along the adaptation, and with fewer demonstrations: 20 episodes.
-CURVE = {"curve": "--curve 1 5 20 50", "long": "--steps 1000 --curve 500"}
-CURVE |= {f"{n}-shot": f"--demonstrations {n}" for n in (1, 3, 5)}
+CURVE = {  # along the adaptation, and with fewer demonstrations: 20 episodes; more of finetune.py
+    "curve": "--curve 1 5 20 50",
+    "long": "--steps 1000 --curve 500",
+    "1-shot": "--demonstrations 1",
+    "3-shot": "--demonstrations 3",
+    "5-shot": "--demonstrations 5",
+}
 for name, flags in CURVE.items():
     REPORTS[name] = (f"finetune.py --task novel --checkpoint {{run}} --episodes 20 {flags}", SHOWN)
 
@@ -109,9 +124,13 @@ class Job:
             return subprocess.run(words, stdout=log, stderr=log).returncode
 
 
-def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list[Job]:
-    """Training first, then what measures it."""
-    run, flags = Path(f"runs/{suite}-{variant}-seed{seed}"), VARIANTS[variant]
+def jobs_of_run(variant: str, seed: int, *, suite: str, steps: int, episodes: int) -> list[Job]:
+    """The jobs of a run in their order: its training, then the reports that measure it."""
+    flags = VARIANTS[variant]
+    run = Path(f"runs/{suite}-{variant}-seed{seed}")
+    log = run.with_suffix(".log")
+
+    # In another world reports, too, read the recordings that were made in it.
     world, data = "", ""
     if variant in WORLDS:
         world = f"-m tests.oracle {variant} "
@@ -119,20 +138,40 @@ def jobs(variant: str, seed: int, suite: str, steps: int, episodes: int) -> list
 
     resume = " --resume" if (run / "last.pt").exists() else ""
     steps = int(re.findall(r"--steps (\d+)", f"--steps {steps} {flags}")[-1])
-    trained = f"{world}train.py --suite {suite} --preset small --seed {seed} --episodes 0"
-    trained += f" --out {run} --threads 1 --steps {steps} --clip-weights random {flags}{resume}"
-    listed = [Job(trained, run / f"ema-{steps:05d}.pt", run.with_suffix(".log"))]
+    training = (
+        f"{world}train.py --suite {suite} --preset small --seed {seed} --episodes 0 "
+        f"--out {run} --threads 1 --steps {steps} --clip-weights random {flags}{resume}"
+    )
+    jobs = [Job(training, done=run / f"ema-{steps:05d}.pt", log=log)]
     for name, (command, variants) in REPORTS.items():
-        if variant in (variants or REPORTED):
-            out = Path(f"{run}-{name}")
-            script, words = command.format(run=run).split(" ", 1)
-            measured = f"{world}{script} --episodes {episodes} --seed {SEED} {words}{data}"
-            measured += f" --workers 1 --threads 1 --out {out} --overwrite"
-            listed.append(Job(measured, out / "success.json", run.with_suffix(".log")))
-    return listed
+        if variant not in variants:
+            continue
+        out = Path(f"{run}-{name}")
+        script, report_flags = command.format(run=run).split(" ", 1)
+        report = (
+            f"{world}{script} --episodes {episodes} --seed {SEED} {report_flags}{data} "
+            f"--workers 1 --threads 1 --out {out} --overwrite"
+        )
+        jobs.append(Job(report, done=out / "success.json", log=log))
+    return jobs
 
 
-def main(argv: list[str] | None = None) -> None:
+def run_in_order(jobs: Sequence[Job], stopped: threading.Event) -> None:
+    """Runs jobs one after the other, up to one that fails or until `stopped` is set.
+
+    Those whose result exists are skipped.
+    """
+    for job in jobs:
+        if job.done.exists() or stopped.is_set():
+            continue
+        code = job.run()
+        outcome = "done" if code == 0 else f"exit code {code}"
+        print(f"{outcome}: {job.command}", flush=True)
+        if code != 0:
+            return  # what comes after needs it
+
+
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Trains and measures what RESULTS.md shows.")
     parser.add_argument("--only", nargs="+", default=list(VARIANTS), help="these variants")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of training")
@@ -142,29 +181,23 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--at-once", type=int, default=2, help="runs at a time")
     parser.add_argument("--list", action="store_true", help="only say what is done")
     args = parser.parse_args(argv)
-    chains = [
-        jobs(choose(variant, VARIANTS, "variant"), seed, args.suite, args.steps, args.episodes)
+
+    for variant in args.only:
+        choose(variant, VARIANTS, "variant")
+
+    runs = [
+        jobs_of_run(variant, seed, suite=args.suite, steps=args.steps, episodes=args.episodes)
         for seed in args.seeds
         for variant in args.only
     ]
-    stopped = threading.Event()
-
-    def work(chain: list[Job]) -> None:
-        for job in chain:
-            if job.done.exists() or stopped.is_set():
-                continue
-            code = job.run()
-            print(f"{'done' if code == 0 else f'exit code {code}'}: {job.command}", flush=True)
-            if code != 0:
-                return  # what comes after needs it
-
     if args.list:
-        for job in (job for chain in chains for job in chain):
+        for job in chain.from_iterable(runs):
             print(f"{'done' if job.done.exists() else '    '}  python {job.command}")
         return
+    stopped = threading.Event()
     with ThreadPoolExecutor(args.at_once) as pool:
         try:
-            list(pool.map(work, chains))
+            list(pool.map(partial(run_in_order, stopped=stopped), runs))
         finally:
             stopped.set()
 

@@ -410,7 +410,7 @@ def test_a_policy_is_trained_resumed_adapted_and_rolled_out(
     assert all(math.isfinite(x["loss"]) and x["loss"] != x["loss_before"] for x in losses)
     _, info = weights("run/last.pt")
     arguments = info["arguments"]
-    assert arguments["instruction_dropout"] == arguments["support_only"] == 0
+    assert arguments["instruction_dropout"] == arguments["task_dropout"] == 0
     train.main([*argv, "--out", "run", "--resume"])
 
     adapt = ["--task", "door-close", "--checkpoint", "run", "--data", str(recorded), "--out", "new"]

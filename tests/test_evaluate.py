@@ -4,6 +4,7 @@ Most roll out in toy_simulator.py, which takes milliseconds, and without other p
 """
 
 import json
+import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -783,6 +784,27 @@ def test_a_checkpoint_that_cannot_be_measured_so_is_refused(
 def test_without_any_policy_the_user_is_told_how_to_make_one(monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "SHIPPED_CHECKPOINT", Path("none.pt"))
     assert "no finished run on ml10 in runs/: train one" in fails(evaluate, [], capsys)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ("--checkpoint damaged.pt", "damaged.pt is damaged or no PyTorch checkpoint"),
+        ("--data damaged", "touch-red.npz"),
+        ("--clip-weights none.pt", "none.pt: there is no such file"),
+    ],
+)
+def test_the_script_says_of_damaged_files_what_they_are(
+    run, recordings, options, message, monkeypatch, capsys
+):
+    Path("damaged.pt").write_bytes(b"x")
+    Path("damaged").mkdir()
+    Path("damaged/touch-red.npz").write_bytes(b"x")
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *command(run, recordings, options)])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(evaluate.__file__, run_name="__main__")
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and error.startswith("error: ") and message in error
 
 
 def test_a_programmers_mistake_keeps_its_traceback(run, recordings, monkeypatch):

@@ -2,16 +2,31 @@
 
 import json
 import re
+from dataclasses import fields
 
 import numpy as np
 import pytest
 
+from model import PolicyConfig
 from report import wilson_interval
 from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
 from tests.runs import LIMITS, LONGER, TUNING, VARIANTS
-from train import SETTINGS, parse
+from train import SETTINGS, Settings, parse
 
 HELD = json.loads(RESULTS.read_text())
+
+# RESULTS.json keeps every record as it was written, with the names that were used that day. These
+# have another one today.
+RENAMED = {
+    "multi_task_share": "pretrain_fraction",
+    "support_only": "task_dropout",
+    "facts": "provenance",
+}
+
+
+def with_new_names(record):
+    """A record (name -> value) by the names of today."""
+    return {RENAMED.get(name, name): value for name, value in record.items()}
 
 
 def test_the_tables_are_those_of_the_results():
@@ -52,7 +67,8 @@ def test_runs_are_of_the_variants_that_they_name():
     for name, run in HELD.items():
         suite, variant, seed = re.fullmatch(r"(ml\d\d-)?(.*)-seed(\d)", name).groups()
         variant = variant.removesuffix("-eight").removesuffix("-cpu")
-        arguments, config = run["training"]["arguments"], run["training"]["config"]
+        arguments = with_new_names(run["training"]["arguments"])
+        config = run["training"]["config"]
         stated = re.findall(r"--steps (\d+)", VARIANTS.get(variant, ""))
         steps = int(stated[-1]) if stated else 5_000 if suite == "ml45-" else 10_000
         assert arguments["seed"] == int(seed) and arguments["steps"] == steps
@@ -76,6 +92,15 @@ def test_runs_are_of_the_variants_that_they_name():
                 assert used == value, (name, flag)
 
 
+def test_the_settings_of_a_run_are_those_of_today():
+    for name, run in HELD.items():
+        arguments = with_new_names(run["training"]["arguments"])
+        assert set(arguments) <= {field.name for field in fields(Settings)}, name
+        assert set(run["training"]["config"]) <= {field.name for field in fields(PolicyConfig)}, (
+            name
+        )
+
+
 def test_every_result_says_how_it_was_measured():
     for name, run in HELD.items():
         suite = TASKS["ml45" if name.startswith("ml45") else "ml10"]
@@ -84,10 +109,11 @@ def test_every_result_says_how_it_was_measured():
         assert np.isfinite(training["minutes"])
         shipped = name.startswith("ml10-no-inner-loop-cpu-seed")  # of a file with another config
         eight = "-eight-" in name or name.startswith(("before", "ml10-inner-3e-2"))
-        for report in (report for name, report in run.items() if name != "training"):
-            looked = report["facts"].get("n_action_steps", training["config"]["n_action_steps"])
-            assert shipped or (looked == 8) == eight, name  # what stands side by side looks alike
-            assert {"command", "hardware", "seed", "date", "text weights"} <= set(report["facts"])
+        for report in (with_new_names(run[part]) for part in run if part != "training"):
+            provenance = report["provenance"]
+            executed = provenance.get("n_action_steps", training["config"]["n_action_steps"])
+            assert shipped or (executed == 8) == eight, name  # what stands side by side looks alike
+            assert {"command", "hardware", "seed", "date", "text weights"} <= set(provenance)
             for tasks in report["successes"].values():
                 assert set(tasks) <= {*suite["base"], *suite["novel"]}
                 assert set("".join(tasks.values())) <= {*"01"}

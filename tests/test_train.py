@@ -661,7 +661,7 @@ def test_what_cannot_be_resumed_is_said(pair, finished, tmp_path, capsys):
     out.mkdir()
     shutil.copy(finished / "ema-00003.pt", out / "last.pt")
     message = fails(train, [*argv, "--out", out, "--resume"], capsys)
-    assert "no training to go on with" in message
+    assert "last.pt lacks training, recordings" in message
     (out / "last.pt").rename(out / "ema-00003.pt")
     assert "already holds a run" in fails(train, [*argv, "--out", out], capsys)
     with common.locked(tmp_path / "busy"):
