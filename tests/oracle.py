@@ -26,16 +26,13 @@ import common
 import data
 import simulator
 import train
-from camera import RayCastCamera
 from clip import TextWeightsError
 from common import command_line
 from metaworld_env import (
-    ARM_LINKS,
     CAMERA,
     CAMERA_PIXELS,
     CAMERA_POSITION,
     RECIPE,
-    WORKSPACE,
     MetaWorld,
     MetaWorldPointCloudEnv,
 )
@@ -75,14 +72,7 @@ class MetaWorldWithPixels(MetaWorld):
 
     def make(self, task: str, num_points: int) -> MetaWorldPointCloudEnv:
         env = super().make(task, num_points)
-        env.camera = RayCastCamera(
-            env.sawyer_env.model,
-            pixels=2 * CAMERA_PIXELS,
-            box=WORKSPACE,
-            camera=CAMERA,
-            position=CAMERA_POSITION,
-            arm=ARM_LINKS,
-        )
+        env.camera = env.make_camera(2 * CAMERA_PIXELS)
         return env
 
 
