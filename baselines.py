@@ -40,7 +40,6 @@ from model import (
     POLICIES,
     Attention,
     ConditionalUNet1d,
-    ConfigError,
     Context,
     DP3Policy,
     LayerNorm,
@@ -59,7 +58,7 @@ from model import (
 def draw(
     function: Callable, *shape: int, like: Tensor, generator: Generator | None = None
 ) -> Tensor:
-    """`torch.randn` or `torch.rand` of a shape, by a generator on any device, to that of `like`."""
+    """Calls torch.randn or torch.rand on the generator's device, for a result on that of `like`."""
     source = like.device if generator is None else generator.device
     return function(*shape, generator=generator, device=source).to(like.device)
 
@@ -87,7 +86,8 @@ class FlowPolicy(DP3Policy):
     observations on.
     """
 
-    requires: ClassVar = {"sampler": "ddim"}  # it has a sampler of its own, so there is no choice
+    # Its sampler is its own, so there is no choice.
+    requires: ClassVar = {**DP3Policy.requires, "sampler": "ddim"}
 
     START = 0.01  # of t
     STEP = 0.01  # from t to r
@@ -138,8 +138,8 @@ class FlowPolicy(DP3Policy):
         v_t, v_r = velocities.chunk(2)  # 2 x (B, H, A)
         f_t = x_t + (s - t) * v_t
         f_r = x_r + (s - r) * v_r
-        far = s - t > 1.01 * self.STEP
-        distance = (f_t - f_r) ** 2 + self.WEIGHT * far * (v_t - v_r) ** 2  # (B, H, A)
+        r_before_s = s - t > 1.01 * self.STEP  # r < s, with a margin for rounding
+        distance = (f_t - f_r) ** 2 + self.WEIGHT * r_before_s * (v_t - v_r) ** 2  # (B, H, A)
         return distance.mean() / self.STEP**2
 
     forward = loss
@@ -167,7 +167,7 @@ class FlowPolicy(DP3Policy):
 def associative_scan(a: Tensor, b: Tensor) -> Tensor:
     """h_l = a_l h_{l-1} + b_l along dim 1, from h_{-1} = 0: (B, L, ...) twice -> (B, L, ...).
 
-    Two steps in a row are one step of the same kind, (a' a, a' b + b'). Every place is therefore
+    A step (a, b) and then (a', b') are one step (a' a, a' b + b'). Every place is therefore
     joined with the one before it, then with the one two before, four, ...: log2(L) times, each for
     all places at once, where the recurrence takes L. What came before the first changes nothing.
     """
@@ -251,7 +251,8 @@ class MambaResidualBlock(nn.Module):
     def __init__(self, block: ResidualBlock, config: PolicyConfig, index: int):
         super().__init__()
         self.conv1, self.film, self.residual = block.conv1, block.film, block.residual
-        self.condition_dim, self.first_branch = config.condition_dim, index * self.BRANCHES
+        self.condition_dim = config.condition_dim
+        self.first_branch = index * self.BRANCHES
         width = self.conv1[0].out_channels
         self.mamba = MixerBlock(Mamba(width), width)
         self.attention = MixerBlock(Attention(width, self.HEADS), width)
@@ -304,7 +305,7 @@ class MambaPolicy(DP3Policy):
     build it and do not run it. Here it runs. Widths, kernel and horizon are that code's.
     """
 
-    requires: ClassVar = {"denoiser": "mamba-unet"}
+    requires: ClassVar = {**DP3Policy.requires, "denoiser": "mamba-unet"}
 
     DROP = 0.2  # the share of windows that a branch is left out for
 
@@ -446,9 +447,9 @@ class FrequencyTransformer(nn.Module):
     def __init__(self, config: PolicyConfig):
         super().__init__()
         if config.policy != "freq":
-            raise ConfigError(f"frequency-transformer is the denoiser of freq, not {config.policy}")
+            raise ValueError(f"frequency-transformer is the denoiser of freq, not {config.policy}")
         if len(config.unet_widths) != 2:
-            raise ConfigError(f"freq takes two widths, Transformer and head: {config.unet_widths}")
+            raise ValueError(f"freq takes two widths, Transformer and head: {config.unet_widths}")
         H, W, prefix = config.horizon, config.unet_widths[0], config.n_obs_steps + 1
         self.register_buffer("dct", dct_matrix(H).float(), persistent=False)
         self.project_observation = nn.Linear(config.observation_feature_dim, W)
@@ -497,10 +498,10 @@ class FrequencyTransformer(nn.Module):
 class FreqPolicy(DP3Policy):
     """Masked autoregression over frequencies (Zhong et al., arXiv 2506.01583).
 
-    Training: the first c frequencies of an action chunk, c from 0 to H, most of its places hidden,
-    are what the Transformer sees; a diffusion head recovers each of the clean actions. Drawing:
-    four rounds with c = 0, 5, 10, 16 of 16, each on the low frequencies of the round before, at
-    places of which ever fewer are hidden.
+    Training: the Transformer sees an action chunk reduced to its first c frequencies, c from 0 to
+    H, with most of its places hidden. A diffusion head recovers each of the clean actions.
+    Sampling: four rounds, with c = 0, 5, 10, 16 of 16. Each sees the low frequencies of the actions
+    of the round before, and in each fewer places are hidden.
 
     Left open, and chosen: condition tokens stand in the sequence (the code also attends to them
     separately, and has gated MLPs); the share of hidden places is drawn for each window (there: for
@@ -508,7 +509,11 @@ class FreqPolicy(DP3Policy):
     DDIM steps (`small`: five) whose clean action is clipped (there: ten random ones, unclipped).
     """
 
-    requires: ClassVar = {"denoiser": "frequency-transformer", "sampler": "ddim"}
+    requires: ClassVar = {
+        **DP3Policy.requires,
+        "denoiser": "frequency-transformer",
+        "sampler": "ddim",
+    }
     conditioned_by_h = False  # its network embeds timesteps and observations itself
 
     ROUNDS = 4
@@ -630,8 +635,8 @@ denoisers["frequency-transformer"] = FrequencyTransformer
 demo_encoders["mlp"] = DemonstrationMLP
 
 
-def changed(preset: str, **changes: Any) -> PolicyConfig:
-    """DAMI's preset of a name with `changes`, and without a task."""
+def without_task(preset: str, **changes: Any) -> PolicyConfig:
+    """DAMI's preset of a name with `changes`, for a policy that reads no task."""
     return replace(model.PRESETS[preset], demo_encoder="none", tcfm="none", **changes)
 
 
@@ -641,41 +646,41 @@ def changed(preset: str, **changes: Any) -> PolicyConfig:
 PRESETS = {
     "dami": model.PRESETS,
     "dp3": {
-        "paper": changed("paper", policy="dp3"),
-        "small": changed("small", policy="dp3", unet_widths=(48, 96, 192)),
-        "tiny": changed("tiny", policy="dp3"),
+        "paper": without_task("paper", policy="dp3"),
+        "small": without_task("small", policy="dp3", unet_widths=(48, 96, 192)),
+        "tiny": without_task("tiny", policy="dp3"),
     },
     "flow": {
-        "paper": changed("paper", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
-        "small": changed(
+        "paper": without_task("paper", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
+        "small": without_task(
             "small", policy="flow", sampler="ddim", horizon=4, n_action_steps=3,
             unet_widths=(48, 96, 192),
         ),
-        "tiny": changed("tiny", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
+        "tiny": without_task("tiny", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
     },
     "mamba": {
-        "paper": changed(
+        "paper": without_task(
             "paper", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3,
             unet_widths=(128, 256, 512),
         ),
-        "small": changed(
+        "small": without_task(
             "small", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3,
             unet_widths=(32, 64, 112),
         ),
-        "tiny": changed(
+        "tiny": without_task(
             "tiny", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3
         ),
     },
     "freq": {
-        "paper": changed(
+        "paper": without_task(
             "paper", policy="freq", denoiser="frequency-transformer", sampler="ddim",
             unet_widths=(512, 1024),
         ),
-        "small": changed(
+        "small": without_task(
             "small", policy="freq", denoiser="frequency-transformer", sampler="ddim",
             unet_widths=(128, 256),
         ),
-        "tiny": changed(
+        "tiny": without_task(
             "tiny", policy="freq", denoiser="frequency-transformer", sampler="ddim",
             unet_widths=(32, 64),
         ),

@@ -1,354 +1,302 @@
 """Point clouds of any MuJoCo model by casting rays: no OpenGL, no GPU.
 
-    camera = RayCastCamera(model, pixels=84, box=((-1, -1, 0), (1, 1, 1)), camera="corner")
+    camera = RayCastCamera(model, position=(2, -2, 2), lookat=(0, 0, 0.5))
     points = camera.points(data)  # (M, 3) float32, world frame, metres
 
-The camera casts rays (`mujoco.mj_multiRay`) instead of rasterizing. This file imports nothing of
-the project, so that it can be copied alone.
+A ray is cast through each pixel (`mujoco.mj_multiRay`) instead of rasterizing. This file imports
+nothing of the project, so that it can be copied alone: it needs NumPy and MuJoCo 3.2 or later.
 
-Letters: R rays, M points that the camera sees.
+Letters: H and W height and width of an image in pixels, R rays, M points that the camera sees.
 """
 
+import copy
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from scipy.ndimage import binary_dilation
-
-VISIBLE = np.array([True, True, True, False, False, False])  # which groups MuJoCo's renderer shows
-HIDDEN_GROUP = 5
-FAR = 1e3  # metres
-FEW_RAYS = 32  # what fewer meet is looked at more closely
 
 SKY = (0.75, 0.85, 0.95)
 LIGHT = (0.4, -0.5, 0.77)  # direction towards the light, unit length within 1 %
+FAR = 1e9  # metres
+
+# What later releases of MuJoCo do differently: rays may return the normals of surfaces, and the
+# field that says which cameras are orthographic has another name.
+NO_NORMALS = (None,) if "normal" in mujoco.mj_multiRay.__doc__ else ()
+PROJECTION = "cam_projection" if hasattr(mujoco.MjModel, "cam_projection") else "cam_orthographic"
 
 
-def geom_colors(model: mujoco.MjModel) -> np.ndarray:
-    """Returns the RGBA (geoms, 4) in [0, 1] that MuJoCo draws geoms in; of a texture its mean."""
-    colors = model.geom_rgba.astype(np.float64)
+def drawn_colors(model: mujoco.MjModel, kind: str, groups: Sequence[int]) -> np.ndarray:
+    """Returns the RGBA (n, 4) in [0, 1] in which MuJoCo draws the n objects of a kind.
 
-    for geom, material in enumerate(model.geom_matid):
-        if material < 0 or (model.geom_rgba[geom] != (0.5, 0.5, 0.5, 1)).any():
-            continue  # a color of its own goes before the material's
-        colors[geom] = model.mat_rgba[material]
+    The color of a texture is its mean. What is not drawn has alpha 0.
 
-        texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB]
+    Args:
+        kind: "geom", "site", "flex" or "skin".
+        groups: those that are drawn, 0 to 5.
+    """
+    rgba = getattr(model, f"{kind}_rgba")  # (n, 4)
+    material = getattr(model, f"{kind}_matid")  # (n,), -1 for none
+    group = getattr(model, f"{kind}_group").clip(0, mujoco.mjNGROUP - 1)  # (n,)
+
+    textures = np.ones((model.nmat + 1, 3))  # of each material, and of none, whose index is -1
+    for index in range(model.nmat):
+        texture = model.mat_texid[index, mujoco.mjtTextureRole.mjTEXROLE_RGB]
         if texture >= 0:
             start, channels = model.tex_adr[texture], model.tex_nchannel[texture]
             size = model.tex_height[texture] * model.tex_width[texture] * channels
             texels = model.tex_data[start : start + size].reshape(-1, channels)
-            colors[geom, :3] *= texels[::16, :3].mean(axis=0) / 255
+            textures[index] = texels[::16, :3].mean(axis=0) / 255
 
+    colors = rgba.astype(np.float64)
+    undefined = (rgba == (0.5, 0.5, 0.5, 1)).all(axis=1) & (material >= 0)
+    colors[undefined] = model.mat_rgba[material[undefined]]
+    colors[:, :3] *= textures[material]
+    colors[~np.isin(group, groups), 3] = 0
     return colors
 
 
-def meet_ellipsoid(
-    origin: np.ndarray, rays: np.ndarray, center: np.ndarray, axes: np.ndarray, half: np.ndarray
-) -> np.ndarray:
-    """Where rays (R, 3) from `origin` meet an ellipsoid from outside: (R,) metres, or inf.
+def first_hits(
+    model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Casts rays, unit directions (R, 3), from `origin` (3,) at all geoms that are not transparent.
 
-    Its axes are columns (3, 3), half as long as `half` (3,) says, metres.
+    Returns the distances (R,) in metres, inf where nothing is hit, and the geoms (R,), -1 there.
     """
-    distance = np.full(len(rays), np.inf)
-    along, reach = rays @ (center - origin), half.max()
-    away = (center - origin) @ (center - origin)
-    near = np.flatnonzero((along > 0) & (along**2 >= away - reach**2))  # meet the ball around it
+    distance, geom = np.empty(len(rays)), np.empty(len(rays), dtype=np.int32)
+    every_geom = (None, True, -1)  # of each group, static ones too, of each body
+    results = (geom, distance, *NO_NORMALS)
+    mujoco.mj_multiRay(model, data, origin, rays.ravel(), *every_geom, *results, len(rays), FAR)
+    distance[geom < 0] = np.inf
+    return distance, geom
 
-    # In its own frame and stretched it is the unit ball: |start + t * step| = 1.
-    start, step = (origin - center) @ axes / half, rays[near] @ axes / half  # (3,), (near, 3)
-    a, b, c = (step**2).sum(axis=1), step @ start, start @ start - 1
-    under_root = b**2 - a * c
-    with np.errstate(invalid="ignore"):
-        t = (-b - np.sqrt(under_root)) / a  # the first of its two solutions
-    distance[near] = np.where(t >= 0, t, np.inf)  # NaN: it passes by; below 0: from inside
-    return distance
+
+def look_at(position: Sequence[float], lookat: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the pose of an upright camera, as `RayCastCamera.pose` does."""
+    position = np.array(position, dtype=np.float64)
+    backward = position - lookat
+    if not backward.any():
+        raise ValueError(f"a camera at {position} cannot look at that same point")
+    right = np.cross((0, 0, 1), backward)
+    if not right.any():  # it looks straight up or down
+        right = np.array([1.0, 0.0, 0.0])
+    axes = np.stack([right, np.cross(backward, right), backward], axis=1)
+    return position, axes / np.linalg.norm(axes, axis=0)
+
+
+def geoms_of(model: mujoco.MjModel, bodies: Sequence[str | int]) -> np.ndarray:
+    """Returns which geoms belong to these bodies, given by name or index: (geoms,) bool."""
+    return np.isin(model.geom_bodyid, [model.body(body).id for body in bodies])
 
 
 class RayCastCamera:
-    """A fixed pinhole camera that casts rays at a MuJoCo model's visible geoms and sphere sites.
+    """A pinhole camera that casts rays at the geoms and sites of a MuJoCo model.
 
-    MuJoCo's own rays pass through sites, yet goals are often drawn as sphere sites (Meta-World's
-    are), so those are intersected here. Visible is what MuJoCo's renderer shows by default: groups
-    0 to 2, alpha above 0. A body that never moves and is as wide as the workspace, or has a plane,
-    is background: what stands on a floor needs a body of its own.
+    It sees what MuJoCo's renderer draws by default: geoms of every type, and sites, of the groups 0
+    to 2 and with alpha above 0. It does not see tendons; what is half transparent is opaque to it;
+    and from within a geom it sees that geom's inside, which the renderer leaves out. The distance
+    of what is seen equals `mujoco.mj_ray`'s.
 
     Args:
-        model: its camera is moved, and invisible geoms are put into a group that rays pass through.
-        pixels: height and width of the square image.
-        box: ((x, y, z) low, (x, y, z) high) of the workspace, world frame, metres.
-        camera: the name of a camera of the model that is attached to the world.
-        position: where it is moved, world frame, metres; None leaves it where it is.
-        arm: names of bodies whose exact shape does not matter, as it takes most of the time: in
-            clouds, though not in `depth` and `render`, each geom is the ellipsoid in its box.
+        model: it is copied, since casting needs a few changes. What changes in the model later,
+            like sizes and colors, is not seen by this camera. Poses are read from the data.
+        camera: the name or index of a camera of the model. It may be fixed, move with a body, or
+            follow one.
+        position, lookat: in place of `camera`, an upright one at a position that looks at another,
+            world frame, metres. Its field of view is that of the model's free camera.
+        height, width: of the image in pixels.
+        box: ((x, y, z) low, (x, y, z) high), world frame, metres. Only points inside are returned.
+        background: names or indices of bodies that hide what is behind them, but give no points; by
+            default the world itself, to which floors belong.
+        groups: of the geoms and sites that are seen, 0 to 5.
+        sites: whether sites are seen. Goals are often drawn as sites.
+        ellipsoids: names or indices of bodies whose exact shape does not matter: in clouds, though
+            not in `depth` and `render`, their meshes are ellipsoids. Meshes take most of the time.
 
     Raises:
-        ValueError: the camera moves with a body, or does not see the workspace.
+        KeyError, IndexError: the model has no such camera or body.
+        ValueError: not exactly one of `camera` and `position` with `lookat` is given; the camera is
+            orthographic, or has a lens of its own (`sensorsize`); the box is empty; or a flex or a
+            skin would be drawn, which rays do not meet.
     """
 
     def __init__(
         self,
         model: mujoco.MjModel,
-        pixels: int,
-        box: tuple[Sequence[float], Sequence[float]],
-        camera: str,
+        camera: str | int | None = None,
+        *,
         position: Sequence[float] | None = None,
-        arm: Sequence[str] = (),
+        lookat: Sequence[float] | None = None,
+        height: int = 84,
+        width: int = 84,
+        box: tuple[Sequence[float], Sequence[float]] = ((-np.inf,) * 3, (np.inf,) * 3),
+        background: Sequence[str | int] = ("world",),
+        groups: Sequence[int] = (0, 1, 2),
+        sites: bool = True,
+        ellipsoids: Sequence[str | int] = (),
     ):
-        self.model = model
-        self.pixels = pixels
-        self.low, self.high = np.array(box, dtype=np.float64)
+        self.height, self.width = height, width
+        self.low, self.high = np.array(box, dtype=np.float64)  # (3,) each
+        if not (self.low < self.high).all():
+            raise ValueError(f"the box is empty: its low corner is {box[0]}, its high one {box[1]}")
 
-        # Where the camera is and what it looks at.
-        index = model.camera(camera).id
-        follows = model.cam_mode[index] != mujoco.mjtCamLight.mjCAMLIGHT_FIXED
-        if model.cam_bodyid[index] != 0 or follows:
-            raise ValueError(f"camera {camera!r} moves with a body; a fixed one is needed")
-        if position is not None:
-            model.cam_pos[index] = position  # in the model: MuJoCo's renderer would see the same
-        self.origin = model.cam_pos[index].copy()
-        self.tan = np.tan(np.deg2rad(model.cam_fovy[index]) / 2)  # half the image, a metre away
-        rotation = np.empty(9)
-        mujoco.mju_quat2Mat(rotation, model.cam_quat[index])
-        self.rotation = rotation.reshape(3, 3)  # columns: right, up, backward
+        # Where the camera is and how wide it sees.
+        named = camera is not None
+        if named != (position is None) or named != (lookat is None):
+            raise ValueError("give either a camera of the model, or a position and a lookat")
+        if not named:
+            self.camera, self.free_pose = None, look_at(position, lookat)
+            fovy, orthographic = model.vis.global_.fovy, model.vis.global_.orthographic
+        else:
+            self.camera = model.camera(camera).id
+            fovy = model.cam_fovy[self.camera]
+            orthographic = getattr(model, PROJECTION)[self.camera]
+            if model.cam_sensorsize[self.camera].any():
+                raise ValueError(f"camera {camera!r} has a lens of its own, which is not supported")
+        if orthographic:
+            raise ValueError("an orthographic camera is not supported")
+        self.slope = np.tan(np.deg2rad(fovy) / 2)  # of the rays at the image's upper edge
+        self.rays = self.pixel_rays(height, width)
 
-        # What it sees. MuJoCo's rays hit some transparent geoms that its renderer leaves out.
-        self.colors = geom_colors(model)  # (geoms, 4)
-        model.geom_group[self.colors[:, 3] == 0] = HIDDEN_GROUP
-        self.sites = np.flatnonzero(
-            (model.site_type == mujoco.mjtGeom.mjGEOM_SPHERE)
-            & VISIBLE[model.site_group]
-            & (model.site_rgba[:, 3] > 0)
-            & (model.site_size[:, 0] > 0)
-        )
+        # What it sees, and in which colors.
+        for kind in ("flex", "skin"):
+            if drawn_colors(model, kind, groups)[:, 3].any():
+                raise ValueError(f"rays do not meet a {kind}: move it to a group that is not seen")
+        geom_colors = drawn_colors(model, "geom", groups)
+        site_colors = drawn_colors(model, "site", groups)
+        self.colors = np.concatenate([geom_colors[:, :3], site_colors[:, :3], [SKY]])
 
-        # What of it becomes points: all but the background (floor, table, walls) and the arm.
-        visible = VISIBLE[model.geom_group]  # (geoms,) bool, as are all masks of geoms
-        self.background_geoms, self.background_top = self.find_background()
-        of_arm = np.isin(model.geom_bodyid, [model.body(name).id for name in arm])
-        self.arm_geoms = np.flatnonzero(of_arm & visible)  # indices
-        self.object_geoms = ~self.background_geoms & ~of_arm & visible
+        # The model as rays are to see it. `mj_multiRay` passes by a body if a ray does not meet its
+        # bounding volume; but that is made for collisions, and lacks the geoms that take no part in
+        # them. Without one, each ray is tested against each geom, as `mj_ray` does.
+        self.view = copy.copy(model)
+        self.view.body_bvhadr[:] = -1
+        self.view.geom_rgba[:] = geom_colors  # rays pass geoms without a material if alpha is 0
+        self.view.geom_matid[:] = -1
+        meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+        self.types, self.cloud_types = model.geom_type.copy(), model.geom_type.copy()
+        ellipsoid = mujoco.mjtGeom.mjGEOM_ELLIPSOID
+        self.cloud_types[meshes & geoms_of(model, ellipsoids)] = ellipsoid
 
-        # What does not move during an episode; a mocap body is moved.
-        static_bodies = (model.body_weldid == 0) & (model.body_mocapid[model.body_rootid] < 0)
-        self.static_geoms = self.object_geoms & static_bodies[model.geom_bodyid]
-        self.static_poses = None  # where they were when rays were last cast at them
-        self.static_hits = None  # the distances and geoms that `cast` then returned
+        # Rays do not meet sites, so that a second model has a geom for each one that is seen.
+        self.sites = np.flatnonzero(site_colors[:, 3] > 0) if sites else np.zeros(0, dtype=int)
+        spec = mujoco.MjSpec()
+        for site in self.sites:
+            spec.worldbody.add_geom(type=mujoco.mjtGeom(model.site_type[site]), size=(1, 1, 1))
+        self.site_view = spec.compile()
+        self.site_view.geom_size[:] = model.site_size[self.sites]
+        self.site_view.body_bvhadr[:] = -1
+        self.site_data = mujoco.MjData(self.site_view)
 
-        # The rays that meet the workspace: they enter each slab of it before they leave any. And
-        # four for each pixel.
-        rays = self.rays(pixels)  # (pixels**2, 3)
-        with np.errstate(divide="ignore"):
-            first, second = (self.low - self.origin) / rays, (self.high - self.origin) / rays
-        enter = np.minimum(first, second).max(axis=1)  # (pixels**2,) metres
-        leave = np.maximum(first, second).min(axis=1)
-        meets = leave > np.maximum(enter, 0)
-        if not meets.any():
-            raise ValueError(f"camera {camera!r} does not see the workspace: move one of them")
-        self.in_workspace = meets.reshape(pixels, pixels)
-        self.workspace_rays = rays[meets]  # (R, 3)
-        self.cutoff = leave[meets].max()
-        fine = self.rays(2 * pixels).reshape(pixels, 2, pixels, 2, 3)
-        self.fine_rays = fine.swapaxes(1, 2).reshape(pixels, pixels, 4, 3)
+        # What gives no points: the background, and the sky, whose index is -1.
+        background_geoms = geoms_of(model, background)
+        self.background = np.concatenate([background_geoms, np.zeros(model.nsite, bool), [True]])
 
-    def find_background(self) -> tuple[np.ndarray, float]:
-        """Finds the bodies that never move and are as wide as the workspace, or have a plane.
+    def pixel_rays(self, height: int, width: int) -> np.ndarray:
+        """Returns unit directions (H * W, 3) in the camera's frame: right, up, backward.
 
-        Returns their geoms as a mask (geoms,) bool, and how high they reach, world frame, metres.
+        They go through the middle of each pixel, row by row from the top.
         """
-        model = self.model
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-
-        # From boxes in the frames of the geoms to boxes in the world frame.
-        rotation = data.geom_xmat.reshape(-1, 3, 3)
-        boxes = model.geom_aabb[..., None].copy()
-        middle, half = boxes[:, :3], boxes[:, 3:]  # (geoms, 3, 1) each
-        endless = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        middle[endless], half[endless, :, 0] = 0, (FAR, FAR, 0)
-        middle, half = (rotation @ middle)[..., 0], (np.abs(rotation) @ half)[..., 0]  # (geoms, 3)
-        low, high = data.geom_xpos + middle - half, data.geom_xpos + middle + half
-
-        background = np.zeros(model.ngeom, dtype=bool)
-        for body in np.flatnonzero(model.body_weldid == 0):
-            geoms = (model.geom_bodyid == body) & VISIBLE[model.geom_group]
-            if geoms.any():
-                width = high[geoms, 0].max() - low[geoms, 0].min()
-                wide = width >= self.high[0] - self.low[0]
-                background[geoms] = wide or endless[geoms].any()
-        return background, high[background, 2].max(initial=-np.inf)
-
-    def rays(self, pixels: int) -> np.ndarray:
-        """Returns unit directions (pixels**2, 3), world frame, row by row from the top."""
-        across = self.tan * ((np.arange(pixels) + 0.5) / pixels * 2 - 1)
-        x, y = np.meshgrid(across, -across)
-        rays = np.stack([x, y, -np.ones_like(x)], axis=-1).reshape(-1, 3) @ self.rotation.T
+        right = self.slope * (2 * np.arange(width) + 1 - width) / height
+        up = self.slope * (height - 1 - 2 * np.arange(height)) / height
+        x, y = np.meshgrid(right, up)  # (H, W) each
+        rays = np.stack([x, y, -np.ones_like(x)], axis=-1).reshape(-1, 3)
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
+    def pose(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the camera's position (3,) and axes (3, 3), world frame, metres.
+
+        The axes are columns: right, up, backward. Raises ValueError for the data of another model,
+        and where no poses were computed yet.
+        """
+        if data.geom_xpos.shape != self.view.geom_pos.shape:
+            raise ValueError("the data is of another model than the camera")
+        if not data.xmat[0].any():  # the world's, which never turns
+            raise ValueError("the data has no poses yet: call mujoco.mj_forward(model, data) first")
+        if self.camera is None:
+            return self.free_pose
+        return data.cam_xpos[self.camera], data.cam_xmat[self.camera].reshape(3, 3)
+
     def cast(
-        self,
-        data: mujoco.MjData,
-        rays: np.ndarray,
-        cutoff: float = FAR,
-        geoms: np.ndarray | None = None,
-        sites: Sequence[int] | None = None,
+        self, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray, types: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Casts rays from the camera.
+        """Casts rays at geoms and sites.
 
         Args:
             data: the state of the simulation.
+            origin: where the rays begin (3,), world frame, metres.
             rays: unit directions (R, 3), world frame.
-            cutoff: geoms farther away than this are not met, metres.
-            geoms: (geoms,) bool, those to cast at as far as they are visible; None: all.
-            sites: those to cast at; None: all visible sphere sites.
+            types: of the geoms (geoms,), `self.types` or, with ellipsoids, `self.cloud_types`.
 
         Returns:
             The distances (R,) in metres, inf where nothing is hit, and what is hit (R,): the index
-            of a geom, -1 for nothing, or -2 - index of a site.
+            of a geom, the number of geoms plus the index of a site, or -1 for nothing.
         """
-        distance, hit = np.full(len(rays), np.inf), np.full(len(rays), -1, dtype=np.int32)
+        self.view.geom_type[:] = types
+        distance, hit = first_hits(self.view, data, origin, rays)
 
-        groups, near = self.model.geom_group.copy(), np.arange(len(rays))
-        if geoms is not None:
-            self.model.geom_group[~geoms] = HIDDEN_GROUP
-            near = self.near(data, rays, np.flatnonzero(geoms))
-        t, what = np.empty(len(near)), np.empty(len(near), dtype=np.int32)
-        target = (VISIBLE.astype(np.uint8), 1, -1)  # these groups, static geoms too, of every body
-        mujoco.mj_multiRay(
-            self.model, data, self.origin, rays[near].ravel(), *target, what, t, len(near), cutoff
-        )
-        self.model.geom_group[:] = groups
-        distance[near[t >= 0]], hit[near[t >= 0]] = t[t >= 0], what[t >= 0]
-
-        for site in self.sites if sites is None else sites:
-            ball = data.site_xpos[site], np.eye(3), np.repeat(self.model.site_size[site, 0], 3)
-            t = meet_ellipsoid(self.origin, rays, *ball)
-            closer = t < distance
-            distance[closer] = t[closer]
-            hit[closer] = -2 - site
-
+        self.site_data.geom_xpos[:] = data.site_xpos[self.sites]
+        self.site_data.geom_xmat[:] = data.site_xmat[self.sites]
+        site_distance, geom = first_hits(self.site_view, self.site_data, origin, rays)
+        closer = site_distance < distance
+        distance[closer] = site_distance[closer]
+        hit[closer] = self.view.ngeom + self.sites[geom[closer]]
         return distance, hit
 
-    def near(self, data: mujoco.MjData, rays: np.ndarray, geoms: np.ndarray) -> np.ndarray:
-        """Returns which of the rays (R, 3) meet a ball around any of these geoms: indices."""
-        to, radius = data.geom_xpos[geoms] - self.origin, self.model.geom_rbound[geoms]
-        radius[self.model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_PLANE] = np.inf
-        return np.flatnonzero(((rays @ to.T) ** 2 >= (to**2).sum(axis=1) - radius**2).any(axis=1))
+    def points(
+        self, data: mujoco.MjData, *, color: bool = False, segmentation: bool = False
+    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
+        """Returns the points that the camera sees, (M, 3) float32, world frame, metres.
 
-    def cast_at_arm(self, data: mujoco.MjData, rays: np.ndarray) -> np.ndarray:
-        """Returns the distances (R,) in metres to the arm's ellipsoids, inf where none is met."""
-        distance = np.full(len(rays), np.inf)
-        for geom in self.arm_geoms:
-            axes, box = data.geom_xmat[geom].reshape(3, 3), self.model.geom_aabb[geom]
-            center = data.geom_xpos[geom] + axes @ box[:3]
-            t = meet_ellipsoid(self.origin, rays, center, axes, box[3:])
-            np.minimum(distance, t, out=distance)
-        return distance
+        Args:
+            data: the state of the simulation, after `mj_forward`, or a step.
+            color: whether red, green and blue in [0, 1] follow each position: (M, 6).
+            segmentation: whether to return (points, hit), where hit (M,) int32 is the index of each
+                point's geom, or the number of geoms plus the index of its site.
 
-    def points(self, data: mujoco.MjData) -> np.ndarray:
-        """Returns what is seen of objects and sites in the workspace: (M, 3) float32, world frame.
-
-        A ray a pixel is cast, and four where it meets a body or site that few others meet, or goes
-        by it. The background and the arm give no points, but hide what is behind them.
+        Raises:
+            ValueError: the data is of another model, or has no poses yet.
         """
-        targets = self.targets(data)
-        rays = self.workspace_rays  # (R, 3)
-        distance, hit = self.cast_at_objects(data, *targets)
-        there = self.inside(rays, distance)  # (R,) bool
+        origin, axes = self.pose(data)
+        rays = self.rays @ axes.T  # (H * W, 3), from the camera's frame to the world's
 
-        # The pixels of what few rays meet, and those beside them.
-        body = np.where(hit < 0, hit, self.model.geom_bodyid[hit])[there]  # or site, below 0
-        _, which, times = np.unique(body, return_inverse=True, return_counts=True)
-        small = np.zeros(self.in_workspace.shape, dtype=bool)  # (pixels, pixels)
-        small[self.in_workspace] = there
-        small[small] = times[which] < FEW_RAYS
-        small = binary_dilation(small)
-        there &= ~small[self.in_workspace]
+        # A ray that meets the box enters each of its three slabs before it leaves any.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            first, second = (self.low - origin) / rays, (self.high - origin) / rays
+        enter = np.minimum(first, second).max(axis=1)  # (H * W,) metres
+        leave = np.maximum(first, second).min(axis=1)
+        rays = rays[leave > np.maximum(enter, 0)]  # (R, 3)
 
-        more = self.fine_rays[small].reshape(-1, 3)
-        rays = np.concatenate([rays[there], more])
-        distance = np.concatenate([distance[there], self.cast(data, more, *targets)[0]])
-        rays, distance = self.unhidden(data, rays, distance)
-        seen = distance <= self.cast_at_arm(data, rays)
-        return (self.origin + distance[seen, None] * rays[seen]).astype(np.float32)
+        distance, hit = self.cast(data, origin, rays, self.cloud_types)  # (R,) each
+        seen = ~self.background[hit]
+        points, hit = origin + distance[seen, None] * rays[seen], hit[seen]
+        inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
+        points, hit = points[inside], hit[inside]  # (M, 3), (M,)
 
-    def cast_at_objects(
-        self, data: mujoco.MjData, cutoff: float, object_geoms: np.ndarray, sites: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Casts the workspace's rays, at static geoms only if they moved; returns as `cast`."""
-        rays = self.workspace_rays
-        poses = np.concatenate(
-            [data.geom_xpos[self.static_geoms], data.geom_xmat[self.static_geoms]], axis=1
-        )  # (static geoms, 3 + 9)
-        if self.static_poses is None or not np.array_equal(self.static_poses, poses):
-            self.static_poses = poses
-            self.static_hits = self.cast(data, rays, cutoff, self.static_geoms, sites=())
-        distance, hit = self.cast(data, rays, cutoff, object_geoms & ~self.static_geoms, sites)
-        static_distance, static_hit = self.static_hits
-        nearest = np.where(static_distance <= distance, static_hit, hit)
-        return np.minimum(static_distance, distance), nearest
-
-    def arm_points(self, data: mujoco.MjData) -> np.ndarray:
-        """Returns what is seen of the arm in the workspace: (M, 3) float32, on its ellipsoids."""
-        rays = self.workspace_rays
-        rays, distance = self.unhidden(data, rays, self.cast_at_arm(data, rays))
-        seen = distance <= self.cast(data, rays, *self.targets(data))[0]
-        return (self.origin + distance[seen, None] * rays[seen]).astype(np.float32)
-
-    def targets(self, data: mujoco.MjData) -> tuple[float, np.ndarray, np.ndarray]:
-        """What `cast` looks for: how far, (geoms,) bool and the sites of what becomes points."""
-        # A site outside the workspace hides nothing: it marks a place, there is no body.
-        center, radius = data.site_xpos[self.sites], self.model.site_size[self.sites, :1]
-        outside = (center - radius >= self.high) | (center + radius <= self.low)
-        return self.cutoff, self.object_geoms, self.sites[~outside.any(axis=1)]
-
-    def inside(self, rays: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        """Which rays (R, 3) are in the workspace after `distance` (R,) metres, inf allowed."""
-        points = self.origin + np.minimum(distance, FAR)[:, None] * rays
-        return ((points >= self.low) & (points <= self.high)).all(axis=1)
-
-    def unhidden(
-        self, data: mujoco.MjData, rays: np.ndarray, distance: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns those rays (R, 3) and their distances (R,) that no background cuts short.
-
-        Rays that end outside the workspace are dropped, too.
-        """
-        there = self.inside(rays, distance)
-        rays, distance = rays[there], distance[there]
-        height = self.origin[2] + distance * rays[:, 2]  # where they end
-        # The others pass above all of the background.
-        near = np.minimum(height, self.origin[2]) <= self.background_top
-        barrier = np.full(len(rays), np.inf)
-        barrier[near], _ = self.cast(data, rays[near], self.cutoff, self.background_geoms, sites=())
-        return rays[distance <= barrier], distance[distance <= barrier]
+        if color:
+            points = np.concatenate([points, self.colors[hit]], axis=1)  # (M, 6)
+        points = points.astype(np.float32)
+        return (points, hit) if segmentation else points
 
     def depth(self, data: mujoco.MjData) -> np.ndarray:
-        """Returns metres along the viewing direction (pixels, pixels), inf where nothing is hit."""
-        rays = self.rays(self.pixels)
-        distance, _ = self.cast(data, rays)
-        return (distance * (rays @ -self.rotation[:, 2])).reshape(self.pixels, self.pixels)
+        """Returns metres along the viewing direction (H, W), inf where nothing is hit."""
+        origin, axes = self.pose(data)
+        distance, _ = self.cast(data, origin, self.rays @ axes.T, self.types)
+        return (distance * -self.rays[:, 2]).reshape(self.height, self.width)
 
-    def render(self, data: mujoco.MjData, pixels: int) -> np.ndarray:
-        """Returns a picture (pixels, pixels, 3) uint8, shaded by the slope of the surfaces."""
-        rays = self.rays(pixels)
-        distance, hit = self.cast(data, rays)
-        seen = np.isfinite(distance)
-
-        # Counted from the end, -1 is the sky and -2 - i the site i.
-        colors = np.concatenate([self.colors[:, :3], self.model.site_rgba[::-1, :3], [SKY]])
-        color = colors[hit].reshape(pixels, pixels, 3)
+    def render(self, data: mujoco.MjData, height: int, width: int) -> np.ndarray:
+        """Returns a picture (height, width, 3) uint8, shaded by the slope of the surfaces."""
+        origin, axes = self.pose(data)
+        rays = self.pixel_rays(height, width) @ axes.T
+        distance, hit = self.cast(data, origin, rays, self.types)
+        color = self.colors[hit].reshape(height, width, 3)
+        seen = np.isfinite(distance).reshape(height, width)
 
         # The surface at a pixel is spanned by the ways to its neighbors.
-        points = rays * np.where(seen, distance, 10.0)[:, None]
-        points = points.reshape(pixels, pixels, 3)
+        points = (rays * np.where(hit < 0, 10.0, distance)[:, None]).reshape(height, width, 3)
         right = np.diff(points, axis=1, append=2 * points[:, -1:] - points[:, -2:-1])
         up = -np.diff(points, axis=0, append=2 * points[-1:] - points[-2:-1])
         normal = np.cross(right, up)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
 
-        shade = 0.55 + 0.45 * (normal @ np.array(LIGHT))
-        shade = np.where(seen.reshape(pixels, pixels), shade, 1.0)
-        picture = (255 * np.clip(color * shade[..., None], 0, 1)).astype(np.uint8)
-        upside_down = self.rotation[2, 1] < 0  # Meta-World's corner cameras hang so
-        return picture[::-1, ::-1].copy() if upside_down else picture
+        shade = np.where(seen, 0.55 + 0.45 * (normal @ np.array(LIGHT)), 1.0)
+        return (255 * np.clip(color * shade[..., None], 0, 1)).astype(np.uint8)

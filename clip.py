@@ -1,12 +1,12 @@
 """CLIP's text side: the tokenizer, the frozen text tower of ViT-B/32, and its weights.
 
-    features, identity = text_features(["Close the drawer."])    # (1, 512), and whose weights
+    features, identity = text_features(["Close the drawer."])  # (1, 512); identity: of the weights
 
 Source: Radford et al. 2021, "Learning Transferable Visual Models From Natural Language
 Supervision". Modules and tensors carry the names of OpenAI's checkpoint. The tower is never
-trained, so it may use PyTorch's own attention. The official `ViT-B-32.pt` is looked for in the
-cache, then downloaded. Where neither works, seeded random weights take its place, and every
-checkpoint and result says so.
+trained and never differentiated, so PyTorch's own attention serves. The official `ViT-B-32.pt` is
+looked for in the cache, then downloaded. Where neither works, seeded random weights take its
+place, and every checkpoint and result says so.
 
 The file imports nothing from the project and can be copied out alone, with
 `assets/bpe_simple_vocab_16e6.txt.gz`.
@@ -20,6 +20,7 @@ import html
 import http.client
 import math
 import os
+import re
 import tempfile
 import urllib.request
 import warnings
@@ -60,9 +61,11 @@ def clip_vocabulary() -> tuple[dict[int, str], dict[tuple[str, str], int], dict[
     """CLIP's byte -> symbol, pair of symbols -> rank of their merge, symbol -> token id."""
     printable = [b for b in range(256) if 33 <= b <= 126 or 161 <= b <= 172 or b >= 174]
     others = [b for b in range(256) if b not in printable]
-    symbols = {b: chr(b) for b in printable} | {b: chr(256 + i) for i, b in enumerate(others)}
+    symbols = {b: chr(b) for b in printable}
+    for i, b in enumerate(others):  # GPT-2's printable symbols for the other bytes
+        symbols[b] = chr(256 + i)
     with gzip.open(CLIP_MERGES, "rt", encoding="utf-8") as file:
-        lines = file.read().split("\n")[1:48895]  # the ones CLIP was trained with
+        lines = file.read().split("\n")[1:48895]  # a head line; CLIP uses 49152 - 256 - 2 merges
     merges = [tuple(line.split()) for line in lines]
     ranks = {pair: rank for rank, pair in enumerate(merges)}
     vocabulary = [
@@ -109,9 +112,9 @@ def tokenize(texts: str | Sequence[str], context_length: int = 77) -> Tensor:
     _, _, ids = clip_vocabulary()
     tokens = torch.zeros(len(texts), context_length, dtype=torch.long)
     for row, text in zip(tokens, texts):
-        text = html.unescape(html.unescape(ftfy.fix_text(text))).lower()
-        words = [i for word in WORD.findall(text) for i in tokenize_word(word)]
-        sequence = [ids[START], *words[: context_length - 2], ids[END]]
+        text = html.unescape(html.unescape(ftfy.fix_text(text))).lower()  # twice, as OpenAI does
+        word_ids = [token for word in WORD.findall(text) for token in tokenize_word(word)]
+        sequence = [ids[START], *word_ids[: context_length - 2], ids[END]]
         row[: len(sequence)] = torch.tensor(sequence)
     return tokens  # (B, context_length)
 
@@ -252,9 +255,9 @@ def file_sha256(path: Path) -> str:
 
 
 def read_official(path: Path) -> CLIPTextEncoder:
-    """The text tower of OpenAI's own file, a TorchScript archive; check its SHA-256 before."""
+    """The text tower of OpenAI's TorchScript archive, whose SHA-256 the caller has checked."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # TorchScript is deprecated, OpenAI's file is what it is
+        warnings.simplefilter("ignore")  # TorchScript is deprecated, OpenAI's file is of 2021
         weights = torch.jit.load(str(path), map_location="cpu").state_dict()
     return CLIPTextEncoder(weights, f"openai-ViT-B-32-{CLIP_SHA256[:8]}")
 
@@ -346,7 +349,8 @@ def load_clip_text_encoder(
         "random-seed-<seed>".
 
     Raises:
-        TextWeightsError: the file is missing, cut off, not the official archive, lacks a tensor.
+        TextWeightsError: the file (given, cached or downloaded) is missing, cut off or not the
+            official archive, or it lacks a tensor.
     """
     if weights == "random":
         return random_clip_text_encoder(seed)
@@ -383,7 +387,8 @@ def text_features(
 
     Args:
         instructions: plain sentences, B of them.
-        weights: the value of --clip-weights: a file, `random`, or None for what is there.
+        weights: the value of --clip-weights: a file or `random`. None: the cached file, else a
+            download, else random weights.
         identity: the text weights that a checkpoint was made with. No others are accepted, and if
             they were random ones, the same are drawn again without looking for CLIP's.
 
@@ -393,9 +398,11 @@ def text_features(
     Raises:
         TextWeightsError: the weights that can be had are not those of the checkpoint.
     """
-    if weights is None and identity is not None and identity.startswith("random"):
-        weights = "random"
-    encoder = load_clip_text_encoder(weights)
+    random_seed = re.fullmatch(r"random-seed-(\d+)", identity or "")
+    if random_seed and weights in (None, "random"):
+        encoder = load_clip_text_encoder("random", seed=int(random_seed[1]))
+    else:
+        encoder = load_clip_text_encoder(weights)
     if identity is not None and encoder.identity != identity:
         raise TextWeightsError(
             f"the checkpoint was made with the text weights {identity!r}, here are "

@@ -1,8 +1,8 @@
 """What every script does the same way. Nothing here is part of the method: skip it when reading.
 
 Settings become flags; a user's mistake ends in one line and exit code 2; a folder belongs to one
-run; Ctrl-C lets the step at hand finish; work is shared among processes. No function here knows
-what a policy, a task or the folder of a run is, and nothing of the project is imported.
+run; Ctrl-C lets the step at hand finish; work is shared among processes. Nothing of the project is
+imported; only some flags and messages name what its scripts work on.
 """
 
 import argparse
@@ -108,7 +108,9 @@ def add_common_flags(parser: Any) -> None:
         "--workers", type=int, help="processes for collecting and evaluating (default: one a core)"
     )
     parser.add_argument(
-        "--threads", type=int, help="of PyTorch; 1 beside busy processes (default: one a core)"
+        "--threads",
+        type=int,
+        help="PyTorch's CPU threads; use 1 beside busy processes (default: one a core)",
     )
     parser.add_argument(
         "--clip-weights",
@@ -116,30 +118,33 @@ def add_common_flags(parser: Any) -> None:
     )
 
 
-def choose(name: str, names: Iterable[str], what: str) -> str:
+def choose(name: str, names: Iterable[str], kind: str) -> str:
     """Returns `name` if it is one of `names`; otherwise UserError with the nearest right one."""
     names = sorted(names)
     if name in names:
         return name
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.4)
     advice = f"did you mean {near[0]!r}?" if near else f"choose one of: {', '.join(names)}"
-    raise UserError(f"unknown {what} {name!r}: {advice}")
+    raise UserError(f"unknown {kind} {name!r}: {advice}")
 
 
 # ---- Command lines -------------------------------------------------------------------------------
 
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+SIGNALS = tuple(  # that end a process; Windows has no SIGHUP
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 
 
 def command_line(main: Callable[[], None], errors: tuple[type[Exception], ...] = ()) -> None:
     """Runs a script's `main` and turns what a user can cause into one line on stderr.
 
-    UserError and `errors` (of files that are damaged or foreign), a full disk and too little
-    memory end in exit code 2; Ctrl-C, SIGTERM and a closed terminal in 130. Every other exception
-    is a mistake in the code and keeps its traceback; `python -X dev` shows all tracebacks.
+    UserError, the exception types in `errors` (those of damaged or foreign files), a full disk and
+    too little memory end in exit code 2; Ctrl-C, SIGTERM and a closed terminal in 130. Every other
+    exception is a mistake in the code and keeps its traceback; `python -X dev` shows all of them.
     """
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
-    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+    for number in SIGNALS:
         if signal.getsignal(number) == signal.SIG_DFL:  # `nohup` has SIGHUP ignored
             signal.signal(number, signal.default_int_handler)
     try:
@@ -171,9 +176,9 @@ def describe_user_error(error: Exception, errors: tuple[type[Exception], ...]) -
 def pick_device(name: str | None, threads: int | None = None) -> torch.device:
     """The device of that name; without a name `cuda` where there is one, else `cpu`.
 
-    `threads` is how many PyTorch uses on the CPU. They wait for each other, so one of them whose
-    core is busy with another process delays all. Rounding depends on their number. Raises
-    UserError for a device that cannot be used here.
+    `threads` is the number of PyTorch's CPU threads. An operation ends when all of its threads have
+    ended, so one thread on a busy core delays the whole operation. With another number of threads
+    results may differ in their last digits. Raises UserError for a device that cannot be used here.
     """
     if threads is not None:
         if threads < 1:
@@ -189,7 +194,7 @@ def pick_device(name: str | None, threads: int | None = None) -> torch.device:
             f"--device {name} cannot be used here ({reason}): use --device cpu"
         ) from error
     if device.type == "cuda":
-        torch.set_float32_matmul_precision("high")  # TF32, as PyTorch has convolutions anyway
+        torch.set_float32_matmul_precision("high")  # TF32, as in convolutions by default
         torch.cuda.set_device(device.index or 0)  # for streams and graphs
     return device
 
@@ -230,7 +235,7 @@ def format_table(rows: Sequence[Sequence[Any]]) -> str:
 
 
 def print_settings(used: dict[str, Any], default: dict[str, Any]) -> None:
-    """Prints a table of what a run is made of, and of the default where that is different."""
+    """Prints a table of a run's settings, with the default beside a value that differs from it."""
     rows = [["setting", "value", "default"]]
     for name, value in used.items():
         usual = default.get(name, value)
@@ -244,7 +249,7 @@ def format_value(value: Any) -> str:
 
 
 class StandardError:
-    """stderr for a progress bar. Ctrl-C also ends the `tee` of `2>&1 | tee log`: no error."""
+    """stderr for a progress bar. It may be gone: Ctrl-C in `command 2>&1 | tee` ends tee."""
 
     def write(self, text: str) -> None:
         with suppress(OSError, ValueError):
@@ -270,7 +275,10 @@ def append_json(path: Path, **values: Any) -> None:
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The lines of such a file, without one that a killed process did not finish."""
+    """The lines of such a file, without one that a killed process did not finish.
+
+    Whoever goes on with a file after a kill writes it anew from these lines first.
+    """
     if not path.exists():
         return []
     lines = []
@@ -284,20 +292,33 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Makes a folder that no other process may run in; UserError if one does.
+def locked(
+    folder: Path, name: str = ".lock", flag: str = "--out", waiting: str | None = None
+) -> Iterator[None]:
+    """Makes a folder, and holds a lock in it that one process can have at a time.
 
     The operating system frees the lock when this process ends, however that comes about.
+
+    Args:
+        folder, name: of the lock's file.
+        flag: names the folder on the command line.
+        waiting: is printed, and then another process is waited for; None: that is refused.
+
+    Raises:
+        UserError: another process has the lock, or the folder cannot be written to.
     """
-    lock = filelock.FileLock(folder / ".lock")
+    lock = filelock.FileLock(folder / name)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
     except filelock.Timeout:
-        raise UserError(f"another process runs in {folder}: use another --out") from None
+        if waiting is None:
+            raise UserError(f"another process runs in {folder}: use another {flag}") from None
+        print(waiting, flush=True)
+        lock.acquire()
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise UserError(f"{folder} cannot be written to ({reason}): use another --out") from None
+        reason = error.strerror or error
+        raise UserError(f"{folder} cannot be written to ({reason}): use another {flag}") from None
     try:
         yield
     finally:
@@ -317,14 +338,12 @@ class StopRequest:
     A second one stops at once. Inside `stop.suspended()` the first one does, too.
     """
 
-    NUMBERS = (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))
-
     def __init__(self) -> None:
         self.requested = False
         self.previous: dict[int, Any] = {}
 
     def __enter__(self) -> "StopRequest":
-        for number in self.NUMBERS:
+        for number in SIGNALS:
             if signal.getsignal(number) != signal.SIG_IGN:  # `nohup` has SIGHUP ignored
                 self.previous[number] = signal.signal(number, self.handle)
         return self
@@ -340,7 +359,7 @@ class StopRequest:
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """For long work that has nothing to save: the handlers are those of before."""
+        """Restores the previous handlers inside, for long work that has nothing to save."""
         self.__exit__()
         try:
             yield
@@ -350,7 +369,8 @@ class StopRequest:
 
 # ---- Worker processes ----------------------------------------------------------------------------
 
-# In a worker process: where `report_progress` puts what it is told, and what `run_job` calls first.
+# The state of a worker process: the queue that `report_progress` writes to, and the setup that
+# `run_job` still has to call.
 worker: dict[str, Any] = {"progress": None, "setup": None}
 
 
@@ -361,6 +381,7 @@ def run_jobs(
     workers: int | None,
     total: int,
     description: str,
+    unit: str = "episode",
     setup: Callable[[], None] | None = None,
 ) -> list:
     """Calls `job(**arguments)` for each dictionary of arguments, in several processes.
@@ -369,7 +390,7 @@ def run_jobs(
         job: a function of a module; it may call `report_progress`.
         jobs: the keyword arguments of each call.
         workers: processes; None: one a core.
-        total, description: what the progress bar counts to, and what it is called.
+        total, description, unit: what the progress bar counts to, its name, what it counts.
         setup: called once in each process before its first job; a function of a module, or a
             `functools.partial` of one.
 
@@ -385,15 +406,15 @@ def run_jobs(
     if not jobs:
         return []
     context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
-    others = set(multiprocessing.active_children())
-    with ignored_signals():  # processes inherit that: a terminal sends Ctrl-C to them, too
+    existing_children = set(multiprocessing.active_children())
+    with ignored_signals():  # workers inherit that: a terminal sends Ctrl-C to them, too
         progress = context.SimpleQueue()
         count = min(workers or os.cpu_count() or 1, len(jobs))
         pool = ProcessPoolExecutor(count, context, start_worker, (progress, setup))
         futures = [pool.submit(run_job, job, arguments) for arguments in jobs]
     started = False
     try:
-        with progress_bar(total=total, desc=description, unit="episode") as bar:
+        with progress_bar(total=total, desc=description, unit=unit) as bar:
             pending = set(futures)
             while pending:
                 done, pending = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
@@ -417,7 +438,7 @@ def run_jobs(
     finally:
         with ignored_signals():
             if not all(future.done() and not future.exception() for future in futures):
-                for process in set(multiprocessing.active_children()) - others:
+                for process in set(multiprocessing.active_children()) - existing_children:
                     process.kill()
             pool.shutdown(cancel_futures=True)  # waits for the processes
 
@@ -431,7 +452,7 @@ def ignored_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = {number: signal.signal(number, signal.SIG_IGN) for number in StopRequest.NUMBERS}
+    previous = {number: signal.signal(number, signal.SIG_IGN) for number in SIGNALS}
     try:
         yield
     finally:
@@ -472,10 +493,10 @@ def report_progress(text: str, amount: int) -> None:
 class CUDAGraphed:
     """A function of tensors as one CUDA graph: it is launched at once and not kernel by kernel.
 
-    The first call records the graph on copies of its inputs. Every call copies its inputs over
-    those, so they must have the same shapes, and replays the graph. Whatever else the function
-    reads, such as weights, must stay at its place in memory. What it returns is overwritten by the
-    next call.
+    The first call clones its inputs and captures the graph on the clones. Every call copies its
+    inputs into the clones, so their shapes must never change, and replays the graph. Other tensors
+    that the function reads, such as weights, must stay at their place in memory. The tensors that
+    are returned are overwritten by the next call.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -484,12 +505,12 @@ class CUDAGraphed:
 
     def __call__(self, *inputs: Any) -> Any:
         if self.inputs is None:
-            self.record(inputs)
+            self.capture(inputs)
         torch._foreach_copy_(tree_leaves(self.inputs), tree_leaves(inputs))
         self.graph.replay()
         return self.outputs
 
-    def record(self, inputs: Any) -> None:
+    def capture(self, inputs: Any) -> None:
         self.inputs = tree_map(torch.clone, inputs)
         self.graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())

@@ -6,8 +6,8 @@ its `batch` draws what `DAMIPolicy.loss` takes beside the instruction and the no
 project is imported.
 
 Letters: W windows, T demonstration frames, F stored frames, N points, P numbers a point (x, y, z
-and features), E episodes, H = 16 horizon, To = 2 observation steps, Ta = 8 executed actions,
-A action dim, S state dim, M points of a cloud before sampling.
+and features), E episodes, H horizon (16 by default), To observation steps (2), Ta executed actions
+(8), A action dim, S state dim, M points of a cloud before sampling.
 """
 
 import json
@@ -45,7 +45,7 @@ def positions(points: Any) -> Any:
 
 
 def farthest_point_sample(points: np.ndarray, n: int) -> np.ndarray:
-    """Samples n of the points (M, P) float32, each the farthest from all before it.
+    """Samples n of the points (M, P) float32: the first one, then always the farthest from those.
 
     Distances are those of the positions; a point keeps its features. Returns (n, P) float32 in the
     order of selection, so that the first k of the n are themselves such a sample of k. The same
@@ -184,7 +184,7 @@ class Demonstrations:
             array = getattr(self, name)
             if not np.isfinite(array).all() or float(np.abs(array).max()) >= 1e30:
                 raise RecordingError(
-                    f"{name} holds NaN or infinite numbers: record it again, in metres"
+                    f"{name} holds NaN, infinite or huge numbers: record it again, in metres"
                 )
 
     def check_points(self) -> None:
@@ -237,7 +237,7 @@ class Demonstrations:
         frames = self.meta["success_frames"]
         if (
             not isinstance(frames, list)
-            or len(frames) < len(self)  # of those that `take` left out there may be more
+            or len(frames) < len(self)  # `take` keeps the entries of episodes that it drops
             or any(type(frame) is not int or frame < 0 for frame in frames)
         ):
             raise RecordingError(
@@ -395,25 +395,26 @@ def read_json(path: Path, name: str, array: np.ndarray) -> Any:
 
 SHIFT = (0.1, 0.1, 0.05)  # metres along each axis, at most
 TURN = math.radians(10)  # about the vertical, at most
-STRETCH = 0.1  # share of shear and stretch, at most
+STRETCH = 0.1  # added to each entry of an identity matrix, at most
 
 
 def sample_affine_maps(n: int, center: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Draws n affine maps of space, x -> x A^T + b: a shear and stretch, a turn, a shift.
 
-    The turn is about the vertical through `center` (1, 3). Returns A (n, 3, 3) and b (n, 1, 3).
+    Before the shift `center` (1, 3) stays where it is; the turn is about the vertical. Returns
+    A (n, 3, 3) and b (n, 1, 3).
     """
 
-    def symmetric(*shape: int) -> Tensor:
-        """Uniform numbers in [-1, 1), on the CPU."""
+    def uniform(*shape: int) -> Tensor:
+        """Uniform numbers in [-1, 1), on the CPU whatever the generator's device."""
         return 2 * torch.rand(shape, generator=generator, device=generator.device).cpu() - 1
 
-    angle = TURN * symmetric(n)
+    angle = TURN * uniform(n)
     cos, sin = angle.cos(), angle.sin()
     zero, one = torch.zeros(n), torch.ones(n)
     turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1).view(n, 3, 3)
-    a = turn @ (torch.eye(3) + STRETCH * symmetric(n, 3, 3))  # (n, 3, 3)
-    b = center - center @ a.mT + torch.tensor(SHIFT) * symmetric(n, 3)[:, None]  # (n, 1, 3)
+    a = turn @ (torch.eye(3) + STRETCH * uniform(n, 3, 3))  # (n, 3, 3)
+    b = center - center @ a.mT + torch.tensor(SHIFT) * uniform(n, 3)[:, None]  # (n, 1, 3)
     return a, b
 
 
@@ -438,18 +439,19 @@ class WindowSampler:
 
     A window may begin To - 1 frames before an episode and end Ta - 1 frames after it, the edge
     frames repeated: 193 windows in an episode of 200 frames. An episode too short for a window
-    keeps one. The clouds are held once, as float16. All that is drawn is float32: n windows are
-    points (n, To, N, P), state (n, To, S) and action (n, H, A), a demonstration is demo_points
+    keeps one. The clouds are held once, as float16. What the methods return is float32: n windows
+    are points (n, To, N, P), state (n, To, S) and action (n, H, A); a demonstration is demo_points
     (1, T, N, P), demo_state (1, T, S) and demo_action (1, T, A).
 
     Args:
         demonstrations: of one task.
         config: a `model.PolicyConfig`, or anything with its dimensions.
         device: where the tensors are held.
-        after_success: how many frames after its episode's first success a window may begin, where
-            the recording says which frame that is; None: any number.
+        after_success: no window begins more than so many frames after its episode's first success,
+            if the recording says when that was. None: no limit.
         augment: `batch` moves each scene by an affine map of its own, where the recording says
-            which numbers of a state are positions. No other direction or rotation in it is turned.
+            which numbers of a state are positions. Other directions or rotations in the state or
+            the action stay as they are.
 
     Raises RecordingError for demonstrations that do not fit the policy: dimensions, points, length.
     """
@@ -481,7 +483,7 @@ class WindowSampler:
         self.augment = augment and self.positions_in_state > 0
         self.center = workspace_center(points, demonstrations.meta.get("workspace"))  # (1, 3)
         largest = float(self.action[:, :3].abs().max())
-        self.max_displacement = max(1.0, largest)  # moved actions are clipped to it
+        self.max_displacement = max(1.0, largest)  # moved actions are clipped to [-1, 1] or more
 
         success_frames = demonstrations.meta.get("success_frames")
         windows = []  # of each episode
@@ -498,14 +500,14 @@ class WindowSampler:
         """Raises RecordingError where the policy has other dimensions, or wants more points."""
         config = self.config
         _, num_points, point_dim = demonstrations.points.shape
-        for what, recorded, expected in (
+        for label, recorded, expected in (
             ("numbers a state", demonstrations.state.shape[1], config.state_dim),
             ("numbers an action", demonstrations.action.shape[1], config.action_dim),
             ("numbers a point", point_dim, getattr(config, "point_dim", 3)),
         ):
             if recorded != expected:
                 raise RecordingError(
-                    f"{self.task} has {recorded} {what}, the policy {expected}: "
+                    f"{self.task} has {recorded} {label}, the policy {expected}: "
                     "use recordings, and a checkpoint, that agree"
                 )
         if num_points < config.num_points:
@@ -607,25 +609,21 @@ class WindowSampler:
 
         Points and the positions in a state move together, and the displacement that an action
         begins with turns and stretches with them: the scene stays one of the same task. Takes and
-        returns points (n, T, N, P), state (n, T, S) and action (n, T', A).
+        returns points (n, L, N, P), state (n, L, S) and action (n, K, A): L = To and K = H for
+        windows, L = K = T for a demonstration.
         """
         a, b = sample_affine_maps(len(points), self.center, generator)
         a, b = a.to(points.device), b.to(points.device)
 
-        moved_points = map_positions(positions(points), a, b)  # (n, T, N, 3)
+        moved_points = map_positions(positions(points), a, b)  # (n, L, N, 3)
         points = torch.cat([moved_points, points[..., 3:]], dim=-1)  # features stay as they are
 
         size = 3 * self.positions_in_state
-        in_state = state[..., :size].unflatten(-1, (-1, 3))  # (n, T, positions, 3)
-        moved_in_state = map_positions(in_state, a, b).flatten(-2)  # (n, T, size)
+        in_state = state[..., :size].unflatten(-1, (-1, 3))  # (n, L, positions, 3)
+        moved_in_state = map_positions(in_state, a, b).flatten(-2)  # (n, L, size)
         state = torch.cat([moved_in_state, state[..., size:]], dim=-1)
 
         limit = self.max_displacement
-        displacement = (action[..., :3] @ a.mT).clamp(-limit, limit)  # (n, T', 3)
+        displacement = (action[..., :3] @ a.mT).clamp(-limit, limit)  # (n, K, 3)
         action = torch.cat([displacement, action[..., 3:]], dim=-1)
         return points, state, action
-
-    draw_episode = sample_episode  # old name, until evaluate.py and robot.py are rewritten
-
-
-draw_affine_maps = sample_affine_maps  # old name, until tests/test_train.py is rewritten

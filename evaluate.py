@@ -7,7 +7,7 @@
 
 An episode succeeds if any of its steps reports success, so a rollout ends there. Each rollout
 holds one reference demonstration, drawn from the task's own. Goals come from seeds that no
-demonstration uses. Nothing is adapted here: novel tasks are finetune.py's.
+demonstration uses. Nothing is adapted here; finetune.py adapts to novel tasks.
 
 One action, from the network to the simulated arm: `rollout` keeps the last To observations of each
 episode, `DAMIPolicy.sample_actions` draws a chunk of actions from them, and the environment's
@@ -35,7 +35,7 @@ from torch import Tensor
 import baselines  # noqa: F401  (adds its policies to those that can be loaded)
 import common
 import model
-from clip import text_features
+from clip import TextWeightsError, text_features
 from common import UserError, progress_bar, report_progress, run_jobs
 from data import RecordingError, WindowSampler, load_demonstrations, positions, write_atomically
 from model import CheckpointError, DAMIPolicy
@@ -43,7 +43,7 @@ from report import Parts, Successes, mean_interval, mean_success, paper_columns,
 from simulator import Environment, Simulator, check_task, collect, evaluation_seed, simulator_of
 
 EVALUATION_SEED = 0  # of the goals; the same for every seed of training
-EPISODES_A_JOB = 10  # side by side in one process; part of the protocol: it shapes the noise drawn
+EPISODES_A_JOB = 10  # side by side in one process; with another number other noise is drawn
 
 # ---- Rollouts ------------------------------------------------------------------------------------
 
@@ -88,7 +88,7 @@ def rollout(
         with torch.no_grad():
             contexts.append(policy.encode_demo(text[None], **demonstration))
 
-    # Of each episode the last To observations, the oldest first; at the beginning it is repeated.
+    # Of each episode the last To observations, the oldest first; at first the only one, To times.
     observations = []
     for environment, seed in zip(environments, seeds):
         environment.begin(seed)
@@ -126,10 +126,10 @@ def sample_chunks(
     if contexts[0] is None:  # this architecture reads no task
         return policy.sample_actions(points, state, None, generator).cpu().numpy()
 
-    lengths = {context[0].shape for context in contexts}
-    if len(lengths) == 1:
-        together = tuple(torch.cat(parts) for parts in zip(*contexts))
-        return policy.sample_actions(points, state, together, generator).cpu().numpy()
+    shapes = {context[0].shape for context in contexts}
+    if len(shapes) == 1:
+        stacked = tuple(torch.cat(parts) for parts in zip(*contexts))
+        return policy.sample_actions(points, state, stacked, generator).cpu().numpy()
 
     chunks = [  # demonstrations of different lengths cannot be stacked
         policy.sample_actions(points[[e]], state[[e]], context, generator)
@@ -160,23 +160,25 @@ def take_actions(
 # ---- Checkpoints, and what they say --------------------------------------------------------------
 
 SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
-TRAINED = ("suite", "preset", "arguments", "text_weights", "step")  # beside train.py's weights
+# What train.py saves in a checkpoint beside the weights
+TRAINED = ("suite", "preset", "arguments", "text_weights", "step")
 
 
 def checkpoints_of(path: str | Path) -> list[Path]:
-    """A file as it is; of a run's folder all its EMA checkpoints, the last one last.
+    """The checkpoints of a run's folder in the order of steps, or its adapted.pt; a file as it is.
 
     Raises UserError for a folder without checkpoints.
     """
     path = Path(path)
     if not path.is_dir():
         return [path]
+    # By the length first, since steps may have more than five digits
     by_step = sorted(path.glob("ema-*.pt"), key=lambda file: (len(file.name), file.name))
     found = by_step or list(path.glob("adapted.pt"))
     if not found:
-        inside = ", ".join(str(file.parent) for file in sorted(path.glob("*/adapted.pt")))
-        instead = inside or "a folder of train.py or finetune.py, or a .pt file"
-        raise UserError(f"{path} holds no checkpoint: name {instead}")
+        adapted = ", ".join(str(file.parent) for file in sorted(path.glob("*/adapted.pt")))
+        suggestion = adapted or "a folder of train.py or finetune.py, or a .pt file"
+        raise UserError(f"{path} holds no checkpoint: name {suggestion}")
     return found
 
 
@@ -281,10 +283,11 @@ def evaluate_checkpoint(
     """
     jobs = []
     for task, recording in recordings.items():
-        seeds = [evaluation_seed(seed, episode) for episode in range(episodes)]
         if known_goals:
-            seeds = load_demonstrations(recording).meta["episode_seeds"][:n_demonstrations]
-            seeds = seeds[:episodes]
+            demonstrated = load_demonstrations(recording).meta["episode_seeds"]
+            seeds = demonstrated[:n_demonstrations][:episodes]
+        else:
+            seeds = [evaluation_seed(seed, episode) for episode in range(episodes)]
         for start in range(0, len(seeds), EPISODES_A_JOB):
             jobs.append(
                 {
@@ -296,7 +299,7 @@ def evaluate_checkpoint(
                     "zero_demonstration": zero_demonstration,
                 }
             )
-    successes = run_jobs(
+    job_successes = run_jobs(
         rollout_job,
         jobs,
         workers=workers,
@@ -305,10 +308,10 @@ def evaluate_checkpoint(
         setup=partial(prepare_worker, checkpoint, simulator, str(device), config_overrides or {}),
     )
 
-    results: Successes = {task: [] for task in recordings}
-    for job, of_job in zip(jobs, successes):
-        results[job["task"]] += of_job
-    return results
+    successes: Successes = {task: [] for task in recordings}
+    for job, episode_successes in zip(jobs, job_successes):
+        successes[job["task"]] += episode_successes
+    return successes
 
 
 def prepare_worker(
@@ -569,16 +572,23 @@ def movie_writer(path: str | Path) -> Any:
 # ---- Folders of results --------------------------------------------------------------------------
 
 # What evaluate.py and finetune.py leave in their folder.
-RESULTS = ["success.json", "success.md", "success.png", "held-out.md"]
-RESULTS += ["adapted.pt", "adapted-[0-9]*.pt"]
-RESULTS += ["config.json", "metrics.jsonl", "events.out.tfevents.*"]
+RESULTS = [
+    "success.json",
+    "success.md",
+    "success.png",
+    "held-out.md",
+    "adapted.pt",
+    "adapted-[0-9]*.pt",
+    "config.json",
+    "metrics.jsonl",
+]
 
 
 def claim_results(folder: Path, overwrite: bool) -> list[Path]:
     """Makes a folder for results, and returns the old results in it, which are to be removed.
 
-    They are not removed here but once nothing more can be refused, so that a mistake costs nobody
-    their results. Raises UserError if there are any and `overwrite` is False, or if the folder
+    The caller removes them once nothing more can be refused, so that a mistake costs nobody their
+    results. Raises UserError if there are any and `overwrite` is False, or if the folder
     holds a training run, which is never overwritten.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -934,4 +944,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    common.command_line(main, errors=(RecordingError, CheckpointError))
+    common.command_line(main, errors=(RecordingError, CheckpointError, TextWeightsError))

@@ -57,7 +57,7 @@ COLLECTED = 10  # demonstrations of a simulator's task; of a file all are used
 
 @dataclass(frozen=True)
 class Settings:
-    """What an adaptation is made of; each field is a flag. None: as the preset has it."""
+    """What an adaptation is made of; each field is a flag. None is filled in later."""
 
     steps: int = setting(200, "gradient steps (default: 200)", least=1)
     batch: int | None = setting(None, f"windows a step{common.describe_presets(BATCH)}", least=1)
@@ -92,7 +92,7 @@ def adapt_policy(
     learning_rates: dict[str, float],
     seed: int = 0,
 ) -> Iterator[tuple[int, float, DAMIPolicy]]:
-    """Adapts a copy of a policy to the demonstrations of one task (Algorithm 2, lines 2 to 17).
+    """Adapts a copy of a policy to the demonstrations of one task (Algorithm 2 without its line 3).
 
     Args:
         policy: the meta-trained (EMA) policy; it is left as it is.
@@ -163,10 +163,10 @@ def loss_and_gradients(
 
 
 def resolve(settings: Settings, info: dict[str, Any]) -> Settings:
-    """The settings with numbers where they leave it to the training, which `info` tells.
+    """Fills in what the settings leave open: the windows a step, and the learning rates.
 
-    `info` is what a checkpoint says beside its weights. The paper's learning rates belong to a
-    meta-training at 1e-4; to one at another rate they keep their proportion.
+    Both depend on the training that a checkpoint tells of beside its weights (`info`). The paper's
+    learning rates belong to a meta-training at 1e-4; to another one they are in proportion.
     """
     scale = info["arguments"]["lr"] / PAPER_LEARNING_RATE
     numbers = {"batch": BATCH[info["preset"]]}
@@ -196,7 +196,7 @@ def log_heldout_error(
 
 
 def checkpoint_after(folder: Path, step: int) -> Path:
-    """The checkpoint of an adaptation that goes on after this step."""
+    """The file of the policy as it is after this step, which is not the last one."""
     return folder / f"adapted-{step:05d}.pt"
 
 
@@ -237,7 +237,7 @@ def adapt_checkpoint(
     kept, heldout = hold_out(demonstrations, settings.held_out)
     after_success = info["arguments"]["after_success"]
     sampler = WindowSampler(kept, policy.config, after_success=after_success)
-    write_text(folder / "metrics.jsonl", "")
+    write_text(folder / "metrics.jsonl", "")  # lines are appended
     if heldout is not None:
         heldout_sampler = WindowSampler(heldout, policy.config)
         before, _ = log_heldout_error(folder, 0, policy, sampler, heldout_sampler, text)
@@ -259,7 +259,8 @@ def adapt_checkpoint(
         learning_rates={part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES},
         seed=settings.seed,
     )
-    seconds, began = 0.0, time.monotonic()
+    seconds = 0.0
+    began = time.monotonic()
     with common.progress_bar(
         desc=f"adapting to {demonstrations.task}", unit="step", total=settings.steps
     ) as bar:
@@ -277,10 +278,12 @@ def adapt_checkpoint(
         after, of_mean_action = log_heldout_error(
             folder, settings.steps, adapted, sampler, heldout_sampler, text
         )
-        columns = {"step 0": before, f"step {settings.steps}": after}
-        columns["the mean action"] = of_mean_action
         table = report.heldout_table(
-            {title: {demonstrations.task: error} for title, error in columns.items()}
+            {
+                "step 0": {sampler.task: before},
+                f"step {settings.steps}": {sampler.task: after},
+                "the mean action": {sampler.task: of_mean_action},
+            }
         )
         print(table, flush=True)
         write_text(
@@ -304,7 +307,7 @@ def read_instructions(paths: dict[str, Path], settings: Settings) -> dict[str, s
     instructions = {}
     for task, path in paths.items():
         demonstrations = load_demonstrations(path).take(settings.demonstrations)
-        hold_out(demonstrations, settings.held_out)
+        hold_out(demonstrations, settings.held_out)  # only to check that there are enough
         instructions[task] = demonstrations.instruction
     return instructions
 
@@ -316,7 +319,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Adapts a policy to one task (Algorithm 2).")
     group = parser.add_argument_group("run")
     add = group.add_argument
-    add("--task", nargs="+", help="tasks of the suite's simulator, or `novel`: the suite's own")
+    add("--task", nargs="+", help="tasks of the suite's simulator, or `novel`: all its novel ones")
     add("--suite", help="of the run to start from, and of the tasks (default: the run's, or ml10)")
     add("--data", default="data", help="folder of the demonstrations, or one file (default: data)")
     add("--checkpoint", help="file or run folder to start from (default: the newest run's last)")
@@ -368,12 +371,12 @@ def check_recording(
     if names is not None and list(names) != [recording.task]:
         raise UserError(f"{file} is a recording of {recording.task}, not of {' '.join(names)}")
     if simulator is not None:
-        check_task(simulator, recording.task)
         check_recipe(recording, file, simulator.recipe)
+        check_task(simulator, recording.task)
 
 
 def claim_folders(folders: Iterable[Path], checkpoint: Path, overwrite: bool) -> list[Path]:
-    """The old results in the folders, which are to be removed, see `evaluate.claim_results`.
+    """Makes the folders, and returns the old results in them, see `evaluate.claim_results`.
 
     Raises UserError if `checkpoint` is one of them.
     """
@@ -397,7 +400,7 @@ def adapt_tasks(
     simulator: Simulator | None,
     workers: int | None,
 ) -> tuple[dict[str, Successes], float]:
-    """Adapts a policy to each task by itself, and rolls it out before, in between and after.
+    """Adapts a policy to each task separately; rolls it out before, in between and after.
 
     Args:
         checkpoint: the policy.
@@ -428,15 +431,16 @@ def adapt_tasks(
             continue
 
         columns = {"before": checkpoint}
-        columns |= {f"{step} steps": checkpoint_after(folder, step) for step in sorted(set(curve))}
+        for step in sorted(set(curve)):
+            columns[f"{step} steps"] = checkpoint_after(folder, step)
         columns["after"] = folder / "adapted.pt"
         kept = len(load_demonstrations(paths[task]).take(settings.demonstrations))
         for column, policy in columns.items():
             successes = evaluate.evaluate_checkpoint(
-                policy,
-                simulator,
-                {task: paths[task]},
-                {task: text[task]},
+                checkpoint=policy,
+                simulator=simulator,
+                recordings={task: paths[task]},
+                text={task: text[task]},
                 episodes=settings.episodes,
                 seed=settings.seed,
                 workers=workers,
@@ -531,8 +535,14 @@ def main(argv: Sequence[str] | None = None) -> None:
             **common.provenance("finetune.py", argv, device),
             **config_overrides,
         }
-        paper = report.paper_columns(suite, [policy.config.policy])
-        print(f"\n{report.write_report(out, results, provenance, paper=paper)}")
+        table = report.write_report(
+            out,
+            results,
+            provenance,
+            parts=evaluate.group_tasks(tasks, simulator, suite),
+            paper=report.paper_columns(suite, [policy.config.policy]),
+        )
+        print(f"\n{table}")
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def adapt(
     for _ in range(steps):
         start = {name: p.detach() for name, p in params.items()} if first_order else params
         gradient = grad(loss_fn)(start, batch)
-        # p - lr * gradient, in one pass over the memory instead of two, as in its derivative.
+        # p - lr * gradient: one fused operation, forward and backward, instead of two.
         params = {name: torch.add(p, gradient[name], alpha=-lr) for name, p in params.items()}
     return params
 
@@ -76,8 +76,9 @@ def meta_gradient(
             is up to twice as fast. The batches must have equal shapes and hold tensors only.
 
     Returns:
-        (gradients, after, before): name -> tensor, and the query losses with the adapted parameters
-        and with the given ones, both (tasks,).
+        gradients: name -> tensor.
+        after: the query losses with the adapted parameters, (tasks,).
+        before: the query losses with the given parameters, (tasks,).
 
     Raises:
         ValueError: there is no task, or `vectorize` is less than 1.
@@ -86,7 +87,7 @@ def meta_gradient(
     """
     if vectorize < 1:
         raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
-    # If they required grad, autograd would record all of this once more, beneath torch.func.
+    # Parameters that require grad would make autograd record everything a second time.
     params = {name: p.detach() for name, p in params.items()}
 
     def query_losses(params: Params, support: Any, query: Any) -> Tensor:
@@ -102,15 +103,17 @@ def meta_gradient(
             support, query = tree_map(lambda *parts: torch.stack(parts), *chunk)
             with RightUnderVmap():
                 losses = torch.vmap(query_losses, in_dims=(None, 0, 0))(params, support, query)
-        return losses[:, 0].sum(), losses  # (tasks, 2)
+        return losses[:, 0].sum(), losses  # (tasks of the chunk, 2): after, before
 
-    tasks, total, losses = iter(tasks), None, []
+    tasks = iter(tasks)
+    losses = []
+    total = None  # of the gradients of all tasks
     while chunk := list(islice(tasks, vectorize)):
         gradients, (_, of_chunk) = grad_and_value(summed_query_loss, has_aux=True)(params, chunk)
         losses.append(of_chunk.detach())
         if total is None:
             total = gradients
-        else:  # not in place: two gradients may be one tensor
+        else:  # not in place: autograd may return one tensor as the gradient of two parameters
             total = {name: total[name] + g for name, g in gradients.items()}
     if total is None:
         raise ValueError("meta_gradient needs at least one task")
@@ -127,7 +130,7 @@ def meta_gradient(
 # `vmap`, or raise an error. tests/test_maml.py repeats the comparison.
 
 NORMALIZATIONS = {F.layer_norm, F.batch_norm, F.instance_norm}  # what the layers of torch.nn call
-REFUSED = {  # what those call themselves, in case a loss calls it directly
+REFUSED = {  # the functions underneath, which a loss might call directly
     torch.layer_norm,
     torch.native_layer_norm,
     torch.batch_norm,
@@ -138,9 +141,9 @@ REFUSED = {  # what those call themselves, in case a loss calls it directly
 
 
 class RightUnderVmap(TorchFunctionMode):
-    """Inside this context normalization has its right derivatives, and an embedding, or an error.
+    """Inside this context normalization has its right derivatives under `torch.vmap`.
 
-    NotImplementedError is raised where the derivatives would be wrong.
+    Other functions that PyTorch differentiates wrongly there raise NotImplementedError.
     """
 
     def __torch_function__(
@@ -149,28 +152,31 @@ class RightUnderVmap(TorchFunctionMode):
         kwargs = kwargs or {}
         if func in NORMALIZATIONS:
             return normalize_then_scale(func, *args, **kwargs)
-        if func is F.embedding:
-            options = signature(func).bind(*args, **kwargs).arguments
-            refused = options.get("padding_idx") is not None or options.get("scale_grad_by_freq")
-        else:
-            refused = func in REFUSED
-        if refused:
+        if func in REFUSED or (func is F.embedding and alters_gradient(*args, **kwargs)):
             raise NotImplementedError(
-                f"PyTorch's derivatives of {func.__name__}, called like this, are wrong under "
-                "torch.vmap: use vectorize=1, or a layer of torch.nn without padding_idx and "
-                "scale_grad_by_freq"
+                f"{func.__name__}, called like this, has wrong derivatives under torch.vmap, which "
+                "is used where several tasks run at once: use vectorize=1"
             )
         return func(*args, **kwargs)
 
 
 def normalize_then_scale(function: Callable, *args: Any, **kwargs: Any) -> Tensor:
-    """One of `NORMALIZATIONS`, its weight and bias applied outside it: so it has no such error."""
+    """One of `NORMALIZATIONS`, with its weight and bias applied outside PyTorch's function."""
     options = signature(function).bind(*args, **kwargs).arguments
     weight, bias = options.pop("weight", None), options.pop("bias", None)
     x = function(**options)  # layer_norm: (..., *weight.shape); the others: (B, channels, ...)
-    if function is not F.layer_norm:
-        per_channel = (-1, *[1] * (x.dim() - 2))
-        weight = None if weight is None else weight.view(per_channel)  # (channels, 1, ...)
-        bias = None if bias is None else bias.view(per_channel)
-    x = x if weight is None else x * weight
-    return x if bias is None else x + bias
+    if function is F.layer_norm:
+        shape = options["normalized_shape"]
+    else:
+        shape = (-1, *[1] * (x.dim() - 2))  # (channels, 1, ...)
+    if weight is not None:
+        x = x * weight.view(*shape)
+    if bias is not None:
+        x = x + bias.view(*shape)
+    return x
+
+
+def alters_gradient(*args: Any, **kwargs: Any) -> bool:
+    """Whether a call of `F.embedding` has an option that leaves out or scales gradients."""
+    options = signature(F.embedding).bind(*args, **kwargs).arguments
+    return options.get("padding_idx") is not None or bool(options.get("scale_grad_by_freq"))

@@ -90,8 +90,8 @@ INSTRUCTIONS = {
 
 CAMERA = "corner2"
 CAMERA_POSITION = (0.6, 0.295, 0.8)  # world frame, metres; the orientation stays Meta-World's
-CAMERA_PIXELS = 84  # twice as many where something small is
-ARM_LINKS = tuple(f"right_l{i}" for i in range(7))  # without the hand and its fingers
+CAMERA_PIXELS = 84  # height and width
+ARM_LINKS = tuple(f"right_l{i}" for i in range(7))  # bodies, without the hand and its fingers
 RENDER_PIXELS = 240
 WORKSPACE = ((-0.55, 0.3, -0.05), (0.6, 1.0, 0.48))  # the table and its holes, below the upper arm
 NUM_POINTS = 512
@@ -101,8 +101,8 @@ EPISODE_STEPS = 200
 # How recordings are made. One that was made in another way is refused by `simulator.collect`.
 RECIPE = {
     "simulator": "meta-world",
-    "camera": [CAMERA, list(CAMERA_POSITION), CAMERA_PIXELS, "twice where something small is"],
-    "arm": ["ellipsoids", "after at most", NUM_OBJECT_POINTS],
+    "camera": [CAMERA, list(CAMERA_POSITION), CAMERA_PIXELS],
+    "arm": ["after at most", NUM_OBJECT_POINTS],
     "workspace": [list(corner) for corner in WORKSPACE],
     "num_points": NUM_POINTS,
     "sampling": "farthest points",
@@ -157,14 +157,11 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         self.sawyer_env = sawyer_env
         self.expert = ENV_POLICY_MAP[f"{task}-v3"]()
 
-        self.camera = RayCastCamera(
-            sawyer_env.model,
-            pixels=CAMERA_PIXELS,
-            box=WORKSPACE,
-            camera=CAMERA,
-            position=CAMERA_POSITION,
-            arm=ARM_LINKS,
-        )
+        model = sawyer_env.model
+        model.camera(CAMERA).pos[:] = CAMERA_POSITION
+        links = [model.body(name).id for name in ARM_LINKS]
+        self.arm_geoms = np.flatnonzero(np.isin(model.geom_bodyid, links))
+        self.camera = self.make_camera(CAMERA_PIXELS)
         self.observation_space = gymnasium.spaces.Dict(
             {
                 "point_cloud": gymnasium.spaces.Box(-np.inf, np.inf, (num_points, 3), np.float32),
@@ -173,17 +170,35 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         )
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
 
+    def make_camera(self, pixels: int) -> RayCastCamera:
+        """Makes a camera of `pixels` rows and columns that sees the workspace."""
+        model = self.sawyer_env.model
+        # The floor, the table and its walls: bodies with a geom as wide as the workspace.
+        (low, *_), (high, *_) = WORKSPACE
+        wide = 2 * model.geom_size[:, 0] >= high - low
+        return RayCastCamera(
+            model,
+            CAMERA,
+            height=pixels,
+            width=pixels,
+            box=WORKSPACE,
+            background=np.unique(model.geom_bodyid[wide]),
+            ellipsoids=ARM_LINKS,
+        )
+
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """Begins an episode; without a seed one is drawn. Returns (observation, info)."""
         super().reset(seed=seed)
-        self.begin(int(self.np_random.integers(2**31)) if seed is None else seed)
+        if seed is None:
+            seed = int(self.np_random.integers(2**31))
+        self.begin(seed)
         return self.observe(), {"success": False}
 
     def begin(self, seed: int) -> None:
         """Begins the episode of this seed without casting rays."""
         self.sawyer_env.seed(seed)
         self.expert_observation, _ = self.sawyer_env.reset()
-        # Without this the markers are still where the last episode had them.
+        # Moves the goal markers to this episode's goal: they are still where the last one had them.
         mujoco.mj_forward(self.sawyer_env.model, self.sawyer_env.data)
         self.steps = 0
 
@@ -194,10 +209,11 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
         """Takes one step without casting rays. Returns (reward, truncated, info)."""
-        action = np.clip(np.asarray(action, dtype=np.float32), -1, 1)
+        action = np.asarray(action, dtype=np.float32)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"an action is four finite numbers, not {action}")
 
+        action = np.clip(action, -1, 1)
         self.expert_observation, reward, _, _, info = self.sawyer_env.step(action)
         self.steps += 1
         truncated = self.steps >= self.episode_steps
@@ -218,14 +234,14 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         Where it sees fewer, they are repeated from the first one. Raises ValueError where it sees
         none.
         """
-        N, data = self.num_points, self.sawyer_env.data
-        cloud = self.camera.points(data)  # (M, 3)
+        N = self.num_points
+        points, geoms = self.camera.points(self.sawyer_env.data, segmentation=True)
+        of_arm = np.isin(geoms, self.arm_geoms)  # (M,) bool
+        cloud, arm = points[~of_arm], points[of_arm]
         if len(cloud) > 0:
             cloud = farthest_point_sample(cloud, min(N, NUM_OBJECT_POINTS, len(cloud)))
-        if len(cloud) < N:
-            arm = self.camera.arm_points(data)
-            if len(arm) > 0:
-                arm = farthest_point_sample(arm, min(N - len(cloud), len(arm)))
+        if len(cloud) < N and len(arm) > 0:
+            arm = farthest_point_sample(arm, min(N - len(cloud), len(arm)))
             cloud = np.concatenate([cloud, arm])
         if len(cloud) == 0:
             raise ValueError(f"{self.task}: the camera sees no point inside the workspace")
@@ -237,14 +253,11 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray:
         """Returns a picture (240, 240, 3) uint8 from the camera of the point clouds."""
-        return self.camera.render(self.sawyer_env.data, RENDER_PIXELS)
+        picture = self.camera.render(self.sawyer_env.data, RENDER_PIXELS, RENDER_PIXELS)
+        return picture[::-1, ::-1].copy()  # Meta-World's corner cameras hang upside down
 
     def close(self) -> None:
         self.sawyer_env.close()
-
-    @property
-    def simulator(self) -> gymnasium.Env:  # old name, until its callers are rewritten
-        return self.sawyer_env
 
 
 if "DAMI/MetaWorld-v0" not in gymnasium.registry:

@@ -40,10 +40,6 @@ from torch.optim.swa_utils import AveragedModel
 # ---- Configuration -------------------------------------------------------------------------------
 
 
-class ConfigError(ValueError):
-    """A configuration that no policy can have; the message names the fields and their values."""
-
-
 @dataclass(frozen=True)
 class PolicyConfig:
     """The whole architecture, from which a checkpoint's policy is rebuilt.
@@ -65,7 +61,7 @@ class PolicyConfig:
     demo_encoder: str = "vmt"  # vmt | none, and of baselines.py mlp; see `demo_encoders`
     demo_stride: int = 1  # the demonstration encoder reads every demo_stride-th frame
     demo_positions: int = 200  # learned positions: the longest demonstration, after the stride
-    demo_dim: int = 128  # the table calls it "Action Dim"
+    demo_dim: int = 128  # the paper's table calls it "Action Dim"
     vmt_layers: int = 2
     vmt_heads: int = 4
     tcfm: str = "down"  # which level of the denoiser reads U2T's output: down | mid | up | none
@@ -73,7 +69,7 @@ class PolicyConfig:
     u2t_heads: int = 8
     text_dim: int = 512
     timestep_dim: int = 128
-    denoiser: str = "unet"  # of baselines.py mamba-unet | frequency-transformer; see `denoisers`
+    denoiser: str = "unet"  # or of baselines.py mamba-unet | frequency-transformer
     unet_widths: tuple[int, ...] = (512, 1024, 2048)
     kernel_size: int = 5
     n_groups: int = 8
@@ -89,60 +85,60 @@ class PolicyConfig:
         self.check_relations()
 
     def check_fields(self) -> None:
-        """Raises ConfigError for a field whose value no policy can have."""
+        """Raises ValueError for a field whose value no policy can have."""
         for name, known in choices().items():
             value = getattr(self, name)
             if value not in known:
-                raise ConfigError(f"{name} is {value!r}; use one of {', '.join(known)}")
+                raise ValueError(f"{name} is {value!r}; use one of {', '.join(known)}")
         for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if field.type in (int, str) and type(value) is not field.type:
-                raise ConfigError(f"{name} is {value!r}: use {field.type.__name__}")
-            if field.type is int and not 1 <= value <= 100_000:
-                raise ConfigError(f"{name} is {value}: use at least 1, at most 100000")
-        for name in ("pointnet_widths", "unet_widths"):
-            widths = getattr(self, name)
-            if not widths or any(type(width) is not int or width < 1 for width in widths):
-                raise ConfigError(f"{name} is {widths}: use one width or more, each at least 1")
+            value = getattr(self, field.name)
+            numbers = value if isinstance(value, tuple) else (value,)
+            if field.type is not str and not all(is_size(number) for number in numbers):
+                raise ValueError(f"{field.name} is {value!r}: use whole numbers from 1 to 100000")
+            if value == ():
+                raise ValueError(f"{field.name} is (): use at least one width")
         for name in ("vmt_layers", "u2t_layers"):
             if getattr(self, name) > 99:
-                raise ConfigError(f"{name} is {getattr(self, name)}: use at most 99")
+                raise ValueError(f"{name} is {getattr(self, name)}: use at most 99")
         if self.point_dim < 3:
-            raise ConfigError(f"point_dim is {self.point_dim}: a position alone has 3 numbers")
+            raise ValueError(f"point_dim is {self.point_dim}: a position alone has 3 numbers")
         if self.timestep_dim < 4 or self.timestep_dim % 2:
-            raise ConfigError(f"timestep_dim is {self.timestep_dim}: use an even one, at least 4")
+            raise ValueError(f"timestep_dim is {self.timestep_dim}: use an even one, at least 4")
         if self.kernel_size % 2 == 0:
-            raise ConfigError(f"kernel_size is {self.kernel_size}: use an odd one")
+            raise ValueError(f"kernel_size is {self.kernel_size}: use an odd one")
 
     def check_relations(self) -> None:
-        """Raises ConfigError, which names both, for two fields that contradict each other."""
+        """Raises ValueError, which names both, for two fields that contradict each other."""
         H, To, Ta = self.horizon, self.n_obs_steps, self.n_action_steps
         most = H - To + 1
         if Ta > most:
-            raise ConfigError(f"n_action_steps {Ta}: horizon {H} has {most} after observation {To}")
+            raise ValueError(
+                f"n_action_steps is {Ta}: of horizon {H} there are {most} actions after "
+                f"n_obs_steps {To}"
+            )
         levels = len(self.unet_widths)
         if H % 2 ** (levels - 1):
-            raise ConfigError(
+            raise ValueError(
                 f"horizon {H} is no multiple of {2 ** (levels - 1)}: it is halved between the "
                 f"{levels} levels of unet_widths"
             )
         if self.diffusion_steps % self.inference_steps:
-            raise ConfigError(
+            raise ValueError(
                 f"diffusion_steps {self.diffusion_steps} is no multiple of "
                 f"inference_steps {self.inference_steps}"
             )
         if self.demo_dim % self.vmt_heads:
-            raise ConfigError(
+            raise ValueError(
                 f"demo_dim {self.demo_dim} is no multiple of vmt_heads {self.vmt_heads}"
             )
         if self.condition_dim % self.u2t_heads:
-            raise ConfigError(
+            raise ValueError(
                 f"the condition's width {self.condition_dim} (timestep_dim and To observation "
                 f"features) is no multiple of u2t_heads {self.u2t_heads}"
             )
         for width in self.unet_widths:
             if width % self.n_groups:
-                raise ConfigError(f"unet_widths {width} is no multiple of n_groups {self.n_groups}")
+                raise ValueError(f"unet_widths {width} is no multiple of n_groups {self.n_groups}")
 
     @property
     def observation_feature_dim(self) -> int:
@@ -159,6 +155,10 @@ class PolicyConfig:
         return self.demo_encoder != "none" or self.tcfm != "none"
 
 
+def is_size(value: Any) -> bool:
+    return isinstance(value, int) and 1 <= value <= 100_000
+
+
 # ---- Attention: one block for VMT and U2T --------------------------------------------------------
 
 
@@ -168,7 +168,7 @@ class Attention(nn.Module):
     def __init__(self, width: int, heads: int):
         super().__init__()
         if width % heads:
-            raise ConfigError(f"an attention of width {width} cannot have {heads} heads")
+            raise ValueError(f"an attention of width {width} cannot have {heads} heads")
         self.heads = heads
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
@@ -214,7 +214,7 @@ class PointNetEncoder(nn.Module):
 
     The maximum makes it blind to the order of the points. A point that has the maximum in no
     channel gets no gradient. Only the others, PointNet's critical points, are therefore
-    differentiated (`CriticalPoints`): about a third of all.
+    differentiated, see `CriticalPoints`.
     """
 
     def __init__(
@@ -282,7 +282,7 @@ demo_encoders: dict[str, type[nn.Module]] = {"vmt": VisualMotorTrajectory}
 
 
 class UnpairedUnifiedTask(nn.Module):
-    """U2T: fuses demonstration, instruction and h_k, and is read at h_k's place (Eqs. 6 and 8).
+    """U2T: fuses demonstration, instruction and h_k, and returns h_k's token (Eqs. 6 and 8).
 
     The sequence is [demonstration tokens | text token | h_k]. Only h_k differs from window to
     window and from one diffusion step to the next. With one layer (the default) the keys and values
@@ -448,11 +448,11 @@ class ConditionalUNet1d(nn.Module):
 
         self.mid = nn.ModuleList(ResidualBlock(widths[-1], widths[-1], config) for _ in range(2))
         self.up = nn.ModuleList()
-        for d_out, d_in in pairwise(reversed(widths)):
-            # d_out channels come up from below, and d_out from the skip connection
-            block1 = ResidualBlock(2 * d_out, d_in, config)
-            block2 = ResidualBlock(d_in, d_in, config)
-            upsample = nn.ConvTranspose1d(d_in, d_in, 4, stride=2, padding=1)
+        for below, width in pairwise(reversed(widths)):
+            # `below` channels come up from the level below, and as many from the skip connection
+            block1 = ResidualBlock(2 * below, width, config)
+            block2 = ResidualBlock(width, width, config)
+            upsample = nn.ConvTranspose1d(width, width, 4, stride=2, padding=1)
             self.up.append(nn.ModuleList([block1, block2, upsample]))
         self.head = nn.Sequential(
             ConvBlock(widths[0], widths[0], config.kernel_size, config.n_groups),
@@ -517,16 +517,18 @@ class DiffusionSchedule(nn.Module):
     def step(self, prediction: Tensor, k: int, noisy: Tensor) -> Tensor:
         """One DDIM step from k to k - K / inference_steps, (B, H, A) -> (B, H, A).
 
-        The noise that is put back leads from the prediction, not clipped, to `noisy`. DP3 pins
-        diffusers 0.11.1, which puts back the predicted sample itself (sampler `dp3`): every step
-        then asks again from a guess without noise, and more rollouts succeed.
+        Sampler `ddim` puts back the noise that leads from the prediction, before clipping, to
+        `noisy`. DP3 pins diffusers 0.11.1, which puts back the predicted sample instead of noise
+        (sampler `dp3`): every step then starts from a guess without noise, and more rollouts
+        succeed.
         """
         stride = self.diffusion_steps // self.inference_steps
         a = self.alphas_cumprod[k]
         a_next = self.alphas_cumprod[k - stride] if k >= stride else torch.ones_like(a)
-        noise = (noisy - a.sqrt() * prediction) / (1 - a).sqrt()
         if self.sampler == "dp3":
             noise = prediction
+        else:
+            noise = (noisy - a.sqrt() * prediction) / (1 - a).sqrt()
         return a_next.sqrt() * prediction.clamp(-1, 1) + (1 - a_next).sqrt() * noise
 
 
@@ -541,7 +543,7 @@ class Recording(Protocol):
 class Normalizer(nn.Module):
     """Maps points, state and action to [-1, 1], each coordinate by its range in the data.
 
-    Of a point that is its position. Features of points, such as colours in [0, 1], pass unchanged.
+    Only a point's position is mapped; its features, such as colours in [0, 1], pass unchanged.
     """
 
     def __init__(self, state_dim: int, action_dim: int, point_dim: int = 3):
@@ -553,8 +555,8 @@ class Normalizer(nn.Module):
     def fit(self, recordings: Iterable[Recording]) -> None:
         """Sets the ranges to those of all recordings together.
 
-        A coordinate that hardly moves (range under 1e-4) is centred and not stretched; of an action
-        it is, since what is drawn from [-1, 1] must come back as what the demonstrations did.
+        A coordinate that hardly moves (range under 1e-4) is centred and not stretched. One of an
+        action is stretched, so that a drawn value in [-1, 1] maps back to almost that constant.
         """
         recordings = list(recordings)
         for name in ("points", "state", "action"):
@@ -596,7 +598,7 @@ def split(batch: dict[str, Tensor], n: int) -> tuple[dict[str, Tensor], dict[str
     return support, query
 
 
-# ---- The policy, and its moving average ----------------------------------------------------------
+# ---- The policies, and their moving average ------------------------------------------------------
 
 Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None: no task is read
 
@@ -604,17 +606,17 @@ Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None:
 class DAMIPolicy(nn.Module):
     """The policy: two observations, an instruction and a demonstration in; actions out.
 
-    Raises ConfigError for a configuration of another policy, or one that this class cannot have.
+    Raises ValueError for the configuration of another policy, or one that does not fit this class.
     """
 
-    # What a subclass may say otherwise:
-    requires: ClassVar[dict[str, str]] = {}  # fields of its configuration that have one value
+    # What a subclass may override:
+    requires: ClassVar[dict[str, str]] = {}  # the fields of its configuration with only one value
     conditioned_by_h: ClassVar[bool] = True  # whether its denoiser is modulated by h_k
 
     def __init__(self, config: PolicyConfig):
         super().__init__()
+        self.check_config(config)
         self.config = config
-        self.check_config()
         self.normalizer = Normalizer(config.state_dim, config.action_dim, config.point_dim)
         self.observation_encoder = ObservationEncoder(config)
         if config.demo_encoder != "none":
@@ -630,19 +632,19 @@ class DAMIPolicy(nn.Module):
             config.diffusion_steps, config.inference_steps, config.sampler
         )
 
-    def check_config(self) -> None:
-        """Raises ConfigError for a configuration that names another class, or does not fit this."""
-        config, name = self.config, self.config.policy
-        if POLICIES[name] is not type(self):
-            raise ConfigError(
-                f"policy {name!r} is a {POLICIES[name].__name__} and no {type(self).__name__}: "
+    @classmethod
+    def check_config(cls, config: PolicyConfig) -> None:
+        """Raises ValueError for a configuration that names another class, or does not fit this."""
+        named = POLICIES[config.policy]
+        if named is not cls:
+            raise ValueError(
+                f"policy {config.policy!r} is a {named.__name__} and no {cls.__name__}: "
                 "use build_policy, or name this class in model.POLICIES"
             )
-        if config.reads_task and not self.reads_task:
-            raise ConfigError(f"{name} reads no task: use demo_encoder none and tcfm none")
-        for field, value in self.requires.items():
-            if getattr(config, field) != value:
-                raise ConfigError(f"{name} needs {field} {value}, not {getattr(config, field)}")
+        for name, value in cls.requires.items():
+            found = getattr(config, name)
+            if found != value:
+                raise ValueError(f"policy {config.policy} needs {name} {value!r}, not {found!r}")
 
     @property
     def reads_task(self) -> bool:
@@ -651,6 +653,7 @@ class DAMIPolicy(nn.Module):
 
     @property
     def reads_demonstration(self) -> bool:
+        """Whether a demonstration does; it is not enough that an instruction does."""
         return self.config.demo_encoder != "none"
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -837,10 +840,16 @@ class DAMIPolicy(nn.Module):
         return {"noise": noise.to(device), "timesteps": timesteps.to(device)}
 
 
+class DP3Policy(DAMIPolicy):
+    """DP3: the policy without demonstration and instruction."""
+
+    requires: ClassVar = {"demo_encoder": "none", "tcfm": "none"}
+
+
 def ema_model(policy: DAMIPolicy) -> AveragedModel:
     """The exponential moving average of a policy in training; the averaged policy is its `.module`.
 
-    `.update_parameters(policy)` belongs after each step. The decay grows as the paper's.
+    `.update_parameters(policy)` must be called after each step. The decay grows as in the paper.
     """
 
     @torch.no_grad()
@@ -852,13 +861,6 @@ def ema_model(policy: DAMIPolicy) -> AveragedModel:
 
 
 # ---- What a configuration names, and presets -----------------------------------------------------
-
-
-class DP3Policy(DAMIPolicy):
-    """DP3: the policy without demonstration and instruction."""
-
-    reads_task = False
-    reads_demonstration = False
 
 
 # The policies by `PolicyConfig.policy`. baselines.py adds its own when it is imported.
@@ -879,7 +881,7 @@ def choices() -> dict[str, tuple[str, ...]]:
 def build_policy(config: PolicyConfig) -> DAMIPolicy:
     """The policy that a configuration names, with fresh weights.
 
-    Raises ConfigError, as the policy's class does, for a configuration that does not fit it.
+    Raises ValueError, as the policy's class does, for a configuration that does not fit it.
     """
     return POLICIES[config.policy](config)
 
@@ -953,7 +955,7 @@ def load(
     """Rebuilds the policy that `save` wrote to a file, in evaluation mode on `device`.
 
     Args:
-        needs: names that must be in the file's `info`.
+        needs: the names that `info` must have.
         config_overrides: fields of the configuration that take the place of those in the file.
 
     Returns:
@@ -965,26 +967,31 @@ def load(
     """
     path = Path(path)
     content = read_archive(path, device)
-    version = content.pop("format", None) if isinstance(content, dict) else None
-    if version == "DAMI checkpoint 1":
-        raise CheckpointError(
-            f"{path} was written by an older version of this code: train again, or use that version"
-        )
-    if version != FORMAT:
-        raise CheckpointError(f"{path} holds no policy that this code saved: use another file")
-    missing = [name for name in needs if name not in content]
-    if missing:
-        raise CheckpointError(
-            f"{path} lacks {', '.join(missing)}: use a file of train.py or finetune.py"
-        )
+    check_content(path, content, needs)
+    del content["format"]
+    config, weights = content.pop("config"), content.pop("model")
 
     try:
-        config = replace(PolicyConfig(**content.pop("config")), **config_overrides)
-    except (KeyError, TypeError, ConfigError) as error:  # TypeError: other fields
+        config = replace(PolicyConfig(**config), **config_overrides)
+        POLICIES[config.policy].check_config(config)
+    except (TypeError, ValueError) as error:  # TypeError: a field of another version
         raise CheckpointError(
             f"{path}: weights and configuration do not fit: {one_line(error)}"
         ) from error
-    return restore_policy(path, config, content.pop("model", {}), device), content
+    with torch.device("meta"):  # takes no memory, for a size that the file may not hold
+        empty = build_policy(config)
+    expected = {name: tuple(x.shape) for name, x in empty.state_dict().items()}
+    found = {name: tuple(x.shape) for name, x in weights.items()}
+    for name in [*expected, *found]:
+        if found.get(name) != expected.get(name):
+            raise CheckpointError(
+                f"{path}: weights and configuration do not fit: {name} is {found.get(name)} in the "
+                f"file, and {expected.get(name)} in the policy"
+            )
+
+    policy = build_policy(config).to(device)
+    policy.load_state_dict(weights)
+    return policy.eval(), content
 
 
 def read_archive(path: Path, device: str | torch.device) -> Any:
@@ -1008,22 +1015,23 @@ def read_archive(path: Path, device: str | torch.device) -> Any:
     raise CheckpointError(f"{path} is damaged (in {damaged!r}): use another file")
 
 
-def restore_policy(
-    path: Path, config: PolicyConfig, weights: dict[str, Tensor], device: str | torch.device
-) -> DAMIPolicy:
-    """The policy of a file, in evaluation mode; CheckpointError where the weights do not fit it."""
-    try:
-        with torch.device("meta"):  # takes no memory, for a size that the file may not hold
-            policy = build_policy(config)
-        sizes = {name: x.to("meta") for name, x in weights.items()}
-        policy.load_state_dict(sizes)
-    except (ConfigError, RuntimeError) as error:  # RuntimeError: other names or shapes
+def check_content(path: Path, content: Any, needs: Sequence[str]) -> None:
+    """Raises CheckpointError unless `save` wrote the content of a file, and `needs` are in it."""
+    version = content.get("format") if isinstance(content, dict) else None
+    if version == "DAMI checkpoint 1":
         raise CheckpointError(
-            f"{path}: weights and configuration do not fit: {one_line(error)}"
-        ) from error
-    policy = build_policy(config).to(device)
-    policy.load_state_dict(weights)
-    return policy.eval()
+            f"{path} was written by an older version of this code: train again, or use that version"
+        )
+    if version != FORMAT:
+        raise CheckpointError(f"{path} holds no policy that this code saved: use another file")
+    for part in ("config", "model"):
+        if not isinstance(content.get(part), dict):
+            raise CheckpointError(f"{path} holds no policy (its {part} is missing): use another")
+    missing = [name for name in needs if name not in content]
+    if missing:
+        raise CheckpointError(
+            f"{path} lacks {', '.join(missing)}: use a file of train.py or finetune.py"
+        )
 
 
 def one_line(error: Exception) -> str:
@@ -1126,7 +1134,7 @@ class CriticalPoints(torch.autograd.Function):
     def indices(marked: Tensor, channels: int) -> Tensor:
         """(..., N) int8 -> (..., M) int64: critical points first, then others.
 
-        M is the largest number of critical points in any cloud.
+        M is the largest number of critical points in any cloud (on a GPU a bound of it).
         """
         if marked.is_cuda:
             most = min(channels, marked.shape[-1])  # a bound: the host does not wait for the GPU

@@ -6,7 +6,7 @@
 Nothing here knows a simulator or a policy: results are lists of successes by task, and whoever
 wants means of some of the tasks names them (`parts`).
 
-Letters: T frames, N points, E episodes.
+Letters: T frames, N points.
 """
 
 import json
@@ -44,13 +44,13 @@ def format_success(successes: int, episodes: int) -> str:
 
 
 def pooled_success(results: Successes) -> str:
-    """The episodes of all tasks together, as `format_success` writes them."""
-    episodes = [success for of_task in results.values() for success in of_task]
+    """Success over the episodes of all tasks put together, as `format_success` writes it."""
+    episodes = [success for task_episodes in results.values() for success in task_episodes]
     return format_success(sum(episodes), len(episodes))
 
 
 def mean_success(results: Successes) -> float:
-    """The mean over tasks of the success rate, in percent."""
+    """The mean of the tasks' success rates, in percent; each task counts alike."""
     return 100 * float(np.mean([np.mean(episodes) for episodes in results.values()]))
 
 
@@ -112,19 +112,22 @@ def success_table(
         paper: more columns, see `paper_columns`; those that have none of the tasks are left out.
     """
     tasks = list(next(iter(columns.values())))
+    parts = parts or {"mean": tasks}
     paper = with_any_of(tasks, paper or {})
 
-    def row(title: str, of_tasks: Sequence[str]) -> list[str]:
-        cells = [pooled_success({t: results[t] for t in of_tasks}) for results in columns.values()]
+    def row(title: str, row_tasks: Sequence[str]) -> list[str]:
+        cells = [title]
+        for results in columns.values():
+            cells.append(pooled_success({task: results[task] for task in row_tasks}))
         for rates in paper.values():
-            known = [rates[task] for task in of_tasks if task in rates]
-            cells.append(f"{np.mean(known):.1f}" if len(known) == len(of_tasks) else "")
-        return [title, *cells]
+            known = [rates[task] for task in row_tasks if task in rates]
+            cells.append(f"{np.mean(known):.1f}" if len(known) == len(row_tasks) else "")
+        return cells
 
     rows = [["task", *columns, *paper]]
     rows += [row(task, [task]) for task in tasks]
     if len(tasks) > 1:
-        rows += [row(f"**{name}**", part) for name, part in (parts or {"mean": tasks}).items()]
+        rows += [row(f"**{name}**", part_tasks) for name, part_tasks in parts.items()]
     return format_table(rows)
 
 
@@ -138,7 +141,7 @@ def heldout_table(columns: dict[str, dict[str, float]]) -> str:
 
     `columns` are title -> task -> error, see `evaluate.evaluate_heldout`.
     """
-    tasks = list(next(iter(columns.values())))
+    tasks = list(next(iter(columns.values())))  # all columns have the same
     rows = [["held-out action error", *columns]]
     for task in tasks:
         rows.append([task, *(f"{errors[task]:.4f}" for errors in columns.values())])
@@ -163,7 +166,7 @@ def write_report(
         folder: it is made if it does not exist.
         columns, parts, paper: see `success_table`.
         provenance: how the results were measured, name -> value; "title" is the chart's.
-        checkpoints: label -> results that were measured, too, and are kept in success.json only.
+        checkpoints: label -> results of other checkpoints; they go only into success.json.
     """
     table = success_table(columns, parts, paper)
     report = {"provenance": provenance, "successes": columns}
@@ -196,7 +199,8 @@ def plot_success(
     tasks = list(next(iter(columns.values())))
     paper = with_any_of(tasks, paper or {})
     n_bars = len(columns) + len(paper)
-    places, width = np.arange(len(tasks)), 0.8 / n_bars
+    places = np.arange(len(tasks))
+    width = 0.8 / n_bars
     figure = Figure(figsize=(max(4.5, 2 + 0.9 * len(tasks)), 3.6), layout="constrained")
     axes = figure.subplots()
 
@@ -214,7 +218,7 @@ def plot_success(
         )
     for i, (label, rates) in enumerate(paper.items(), start=len(columns)):
         gray = 0.8 - 0.15 * (i - len(columns))
-        heights = [rates.get(task, 0) for task in tasks]
+        heights = [rates.get(task, math.nan) for task in tasks]  # no bar where it has none
         axes.bar(places + i * width, heights, width, color=str(gray), label=label)
 
     axes.set_xticks(places + width * (n_bars - 1) / 2, tasks, rotation=30, ha="right")
@@ -225,10 +229,10 @@ def plot_success(
 
 
 def plot_curves(folder: Path) -> None:
-    """Writes curves.png of a run: the loss and its running mean, and what was measured meanwhile.
+    """Writes curves.png of a run from its metrics.jsonl.
 
-    That is success, or else the action error on held-out episodes; it has an axis of its own on the
-    right. All of it is read from the run's metrics.jsonl.
+    It shows the training loss of each step and its running mean; on the right axis the success
+    measured during training, or the action error on held-out episodes where there is no success.
     """
     from matplotlib.figure import Figure
 
@@ -286,13 +290,18 @@ def plot_demonstration(
     """
     from matplotlib.figure import Figure
 
-    frames, meta = demonstrations.episode(episode), demonstrations.meta
+    frames = demonstrations.episode(episode)
+    meta = demonstrations.meta
     clouds = positions(demonstrations.points[frames]).astype(np.float32)  # (T, N, 3)
     n_positions = meta.get("positions_in_state", 0)
-    poses = demonstrations.state[frames, : 3 * n_positions]
-    poses = poses.reshape(len(clouds), n_positions, 3)  # (T, positions, 3)
-    boxes = {name: np.array(meta[name]) for name in ("workspace", "tcp_box") if name in meta}
-    low, high = drawn_space([clouds, poses, *boxes.values()])
+    state_positions = demonstrations.state[frames, : 3 * n_positions]
+    state_positions = state_positions.reshape(len(clouds), n_positions, 3)  # (T, positions, 3)
+    boxes = {
+        name: np.array(meta[name])
+        for name in ("workspace", "tcp_box")
+        if meta.get(name) is not None
+    }
+    low, high = bounding_box([clouds, state_positions, *boxes.values()])
 
     columns = min(columns, len(clouds))
     if columns > 1:
@@ -302,11 +311,12 @@ def plot_demonstration(
         figure = Figure(figsize=(8, 9), layout="constrained")
         grid = figure.add_gridspec(2, 1, height_ratios=(5, 1))
 
-    for column, t in enumerate(np.linspace(0, len(clouds) - 1, columns).round().astype(int)):
+    picked_frames = np.linspace(0, len(clouds) - 1, columns).round().astype(int)
+    for column, t in enumerate(picked_frames):
         axes = figure.add_subplot(grid[0, column], projection="3d", computed_zorder=False)
         height = clouds[t, :, 2]
         axes.scatter(*clouds[t].T, c=height, vmin=low[2], vmax=high[2], cmap="viridis", s=2)
-        axes.scatter(*poses[t].T, c="red", s=14)
+        axes.scatter(*state_positions[t].T, c="red", s=14)
         plot_box(axes, boxes.get("workspace"), color="black")
         plot_box(axes, boxes.get("tcp_box"), color="red")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
@@ -325,14 +335,14 @@ def plot_demonstration(
     save_png(figure, path, dpi=110)
 
 
-def drawn_space(places: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def bounding_box(arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """The corners (3,) and (3,) of the box that arrays (..., 3) fill.
 
     Each side is at least a tenth of the longest one, and at least 0.1 mm long, so that a plane and
     a single point can be drawn, too.
     """
-    everything = np.concatenate([x.reshape(-1, 3) for x in places])
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    points = np.concatenate([array.reshape(-1, 3) for array in arrays])
+    low, high = points.min(axis=0), points.max(axis=0)
     longest = max((high - low).max(), 1e-3)
     half = np.maximum(high - low, 0.1 * longest) / 2
     middle = (low + high) / 2
@@ -343,6 +353,7 @@ def plot_box(axes: Any, corners: np.ndarray | None, color: str) -> None:
     """Draws the twelve edges of a box that is given by two corners (2, 3); None: there is none."""
     if corners is None:
         return
-    for a, b in combinations(product(*corners.T), 2):
+    vertices = product(*corners.T)  # 8 of them
+    for a, b in combinations(vertices, 2):
         if np.equal(a, b).sum() == 2:  # they differ along one axis: an edge
             axes.plot(*zip(a, b), color=color, lw=0.5)

@@ -1037,7 +1037,7 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
         text = torch.zeros_like(text)
     torch.set_num_threads(max(1, (os.cpu_count() or 1) - 1))  # a core is left to the servo stream
     generator = torch.Generator().manual_seed(args.seed)
-    demo = sampler.demonstration(sampler.draw_episode(generator))  # held for the whole run
+    demo = sampler.demonstration(sampler.sample_episode(generator))  # held for the whole run
     with torch.no_grad():
         context = policy.encode_demo(text.to(args.device), **demo)
 

@@ -5,25 +5,23 @@
 
 What trains, adapts and evaluates knows a simulator only by the two Protocols below, `Simulator` and
 `Environment`. A new simulator is a file with a class that has their methods, and an entry in
-SIMULATORS for each of its suites of tasks. Nothing is imported of a simulator before it is asked
-for: own recordings are trained on without one.
+SIMULATORS for each of its suites of tasks. Its packages are imported only when one of its suites is
+asked for: own recordings are trained on without them.
 
 Letters: N points of an observation, S state dim, A action dim, T frames of an episode.
 """
 
 import argparse
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
-import filelock
 import numpy as np
 
-from common import UserError, choose, command_line, format_table, report_progress, run_jobs
-from data import Demonstrations, load_demonstrations, save_demonstrations
+from common import UserError, choose, command_line, format_table, locked, report_progress, run_jobs
+from data import Demonstrations, RecordingError, load_demonstrations, save_demonstrations
 
 # ---- What a simulator is -------------------------------------------------------------------------
 
@@ -42,8 +40,8 @@ class Environment(Protocol):
         """Returns the observation of the present moment.
 
         "point_cloud" (N, 3) float32, or (N, point_dim) where points have features such as colours;
-        its first k points are farthest points for every k. "agent_pos" (S,) float32. World frame,
-        metres.
+        in the order of farthest point sampling, so that its first k points are a good sample, too.
+        "agent_pos" (S,) float32. World frame, metres.
         """
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
@@ -69,7 +67,7 @@ class Simulator(Protocol):
     name: str
     instructions: dict[str, str]  # task -> what the robot is told; its order decides the seeds
     recipe: dict[str, Any]  # how recordings are made: "simulator" (the name), "num_points", ...
-    packages: Sequence[str]  # names of those whose versions stand in a recording
+    packages: Sequence[str]  # whose versions are written into recordings
     episode_steps: int  # after so many steps an episode is truncated
 
     def tasks(self, suite: str) -> tuple[list[str], list[str]]:
@@ -96,19 +94,19 @@ SIMULATORS: dict[str, Callable[[], Simulator]] = {"ml10": meta_world, "ml45": me
 
 
 def simulator_of(suite: str) -> Simulator:
-    """Returns the simulator of a suite. Raises UserError, with the nearest right one, for none."""
+    """Returns the simulator of a suite. For an unknown one UserError names the nearest suite."""
     return SIMULATORS[choose(suite, SIMULATORS, "suite")]()
 
 
 def check_task(simulator: Simulator, task: str) -> str:
-    """Returns `task` if it is one of the simulator's; UserError, with the nearest right one."""
+    """Returns `task` if the simulator has it. Otherwise UserError names the nearest task."""
     return choose(task, simulator.instructions, "task")
 
 
 # ---- Seeds of episodes ---------------------------------------------------------------------------
 
-RUN_SEEDS = 1_000  # what a user calls a seed: 0 to 999
-EPISODE_SEEDS = 100_000  # of each of them, for its episodes
+RUN_SEEDS = 1_000  # what a user calls --seed is below this
+EPISODE_SEEDS = 100_000  # episodes that each --seed has
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -127,7 +125,10 @@ def episode_seed(seed: int, episode: int) -> int:
 
 
 def evaluation_seed(seed: int, episode: int) -> int:
-    """Returns the episode seed of a rollout, at least 10**8: no demonstration has its goals."""
+    """Returns the episode seed of a rollout, at least 10**8.
+
+    Those of demonstrations are below, so that no rollout has the goal of a demonstration.
+    """
     return RUN_SEEDS * EPISODE_SEEDS + episode_seed(seed, episode)
 
 
@@ -176,7 +177,7 @@ def check_recipe(demonstrations: Demonstrations, path: str | Path, recipe: dict[
 
 # ---- Collecting demonstrations of the scripted experts -------------------------------------------
 
-ATTEMPTS_PER_EPISODE = 20
+ATTEMPTS_PER_EPISODE = 20  # an expert that needs more of them for each success is given up
 
 
 def collect(
@@ -188,7 +189,7 @@ def collect(
     seed: int = 0,
     workers: int | None = None,
 ) -> dict[str, Path]:
-    """Collects successful episodes of each task, a process a task at a time.
+    """Collects successful episodes of each task; each worker process records one task at a time.
 
     A file that already holds enough episodes is kept, and one that holds fewer is made again. Of
     several processes that collect into one folder, one works at a time.
@@ -196,7 +197,7 @@ def collect(
     Args:
         simulator: whose experts act.
         tasks: some of the simulator's.
-        folder: a file `TASK.npz` for each task is in it then; see data.py.
+        folder: `TASK.npz` of each task is written into it; see data.py.
         episodes: how many of each task.
         seed: chooses objects and goals, 0 to 999.
         workers: processes; None: one a core.
@@ -219,7 +220,8 @@ def collect(
 
     if not missing_tasks(simulator, paths, episodes, seed):
         return paths  # the folder may be read-only
-    with only_collector(folder):
+    waiting = f"another process collects into {folder}: waiting until it is done"
+    with locked(folder, name=".collecting.lock", flag="--data", waiting=waiting):
         jobs = [
             {
                 "simulator": simulator,
@@ -228,7 +230,7 @@ def collect(
                 "episodes": episodes,
                 "seed": seed,
             }
-            for task in missing_tasks(simulator, paths, episodes, seed)
+            for task in missing_tasks(simulator, paths, episodes, seed)  # now, after waiting
         ]
         run_jobs(
             collect_task,
@@ -263,32 +265,14 @@ def missing_tasks(
     return missing
 
 
-@contextmanager
-def only_collector(folder: Path) -> Iterator[None]:
-    """Makes the folder, and waits until no other process collects into it."""
-    lock = filelock.FileLock(folder / ".collecting.lock")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=0)
-    except filelock.Timeout:
-        print(f"another process collects into {folder}: waiting until it is done", flush=True)
-        lock.acquire()
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise UserError(f"{folder} cannot be written to ({reason}): use another --data") from None
-    try:
-        yield
-    finally:
-        lock.release()
-
-
 def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, seed: int) -> None:
     """Records `episodes` successful episodes of one task into a file."""
     start = time.perf_counter()
     env = simulator.make(task, simulator.recipe["num_points"])
     most_attempts = min(ATTEMPTS_PER_EPISODE * episodes, seeds_of_a_task(simulator))
 
-    recorded, episode_seeds, success_frames, attempts = [], [], [], 0
+    recorded, episode_seeds, success_frames = [], [], []  # of each successful episode
+    attempts = 0
     while len(recorded) < episodes:
         if attempts == most_attempts:
             raise UserError(
@@ -331,10 +315,11 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
 def record_episode(env: Environment, seed: int) -> tuple[dict[str, np.ndarray], int] | None:
     """Lets the expert act for one episode.
 
-    Returns its "points" (T, N, 3) float16, "state" (T, S) and "action" (T, A) float32, each of the
+    Returns its "points" (T, N, P) float16, "state" (T, S) and "action" (T, A) float32, each of the
     moment before the step, and the frame of its first success; None if it had none.
     """
-    points, state, actions, success_frame = [], [], [], None
+    points, state, actions = [], [], []  # of each frame
+    success_frame = None
     env.begin(seed)
     truncated = False
     while not truncated:
@@ -353,109 +338,14 @@ def record_episode(env: Environment, seed: int) -> tuple[dict[str, np.ndarray], 
     return arrays, success_frame
 
 
-# ---- Old names, until their callers are rewritten ------------------------------------------------
-#
-# train.py, finetune.py, evaluate.py, report.py, the tutorial and some tests still know Meta-World
-# as this module. With them this whole block goes.
-
-import inspect  # noqa: E402
-import sys  # noqa: E402
-import types  # noqa: E402
-from dataclasses import replace  # noqa: E402
-from functools import wraps  # noqa: E402
-
-OLD_NAMES = ("SUITES", "INSTRUCTIONS", "EPISODE_STEPS", "RECIPE", "MetaWorldPointCloudEnv")
-OLD_NAMES += ("RayCastCamera",)
-
-
-class ModuleWithOldNames(types.ModuleType):
-    def __getattr__(self, name: str) -> Any:
-        if name not in OLD_NAMES:
-            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        import metaworld_env
-
-        return getattr(metaworld_env, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name == "EPISODE_STEPS":
-            import metaworld_env
-
-            metaworld_env.EPISODE_STEPS = value
-            metaworld_env.MetaWorldPointCloudEnv.__init__.__kwdefaults__["episode_steps"] = value
-        else:
-            super().__setattr__(name, value)
-
-    def __delattr__(self, name: str) -> None:  # how pytest's monkeypatch undoes it
-        if name == "EPISODE_STEPS":
-            self.EPISODE_STEPS = 200
-        else:
-            super().__delattr__(name)
-
-
-sys.modules[__name__].__class__ = ModuleWithOldNames
-
-
-def of_meta_world(function: Callable, *old_parameters: str) -> Callable:
-    """Lets a function also be called without its simulator, and by position."""
-
-    @wraps(function)
-    def called(*arguments: Any, **options: Any) -> Any:
-        if not hasattr(next(iter(arguments), options.get("simulator")), "instructions"):
-            options = {**dict(zip(old_parameters, arguments)), **options}
-            return function(meta_world(), **options)
-        return function(*arguments, **options)
-
-    return called
-
-
-collect = of_meta_world(collect, *list(inspect.signature(collect).parameters)[1:])
-check_task = of_meta_world(check_task, "task")
-demonstration_seed = of_meta_world(demonstration_seed, "task", "seed", "attempt")
-
-
-def suite_tasks(suite: str) -> tuple[list[str], list[str]]:
-    return simulator_of(suite).tasks(suite)
-
-
-def is_simulated(recorded: Demonstrations, path: str | Path) -> bool:
-    """Whether a recording is of a task of Meta-World; UserError if it only has such a name."""
-    simulator = meta_world()
-    if recorded.task not in simulator.instructions:
-        return False
-    found = {**recorded.meta, "task": recorded.task}
-    other = [name for name, value in simulator.recipe.items() if found.get(name) != value]
-    if other:
-        what = f"{path} is not Meta-World's {recorded.task} as recorded here"
-        what += f" (another {', '.join(other)})"
-        raise UserError(f"{what}: record it again, or give your task, and its file, another name")
-    return True
-
-
-def own_recordings(folder: str | Path) -> dict[str, Path]:
-    """Task -> file of the recordings in a folder; none if they are Meta-World's, by their names."""
-    paths = {path.stem: path for path in sorted(Path(folder).glob("*.npz"))}
-    known, problem = [task for task in paths if task in meta_world().instructions], None
-    if Path(folder).is_file():
-        problem = f"{folder} is a file: name its folder, all recordings in it are trained on"
-    elif not Path(folder).is_dir():
-        problem = f"there is no folder {folder}: with --suite ml10, experts fill it"
-    elif not paths:
-        problem = f"{folder} holds no recordings (.npz): with --suite ml10, experts fill it"
-    elif known and len(known) < len(paths):
-        problem = f"{folder} mixes your recordings with {known[0]}: move one kind elsewhere"
-    if problem:
-        raise UserError(problem)
-    for task in known:
-        is_simulated(replace(load_demonstrations(paths[task]), task=task), paths[task])
-    return {} if known else paths
-
-
 # ---- Command line --------------------------------------------------------------------------------
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Collects expert demonstrations in a simulator.")
-    parser.add_argument("--suite", default="ml10", help="all its tasks: ml10 or ml45 (ml10)")
+    parser.add_argument(
+        "--suite", default="ml10", help=f"all its tasks: {', '.join(SIMULATORS)} (ml10)"
+    )
     parser.add_argument("--task", help="only this task")
     parser.add_argument("--data", default="data", help="folder of the files (data)")
     parser.add_argument("--episodes", type=int, default=10, help="successful ones a task (10)")
@@ -494,4 +384,4 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, errors=(ValueError,))  # RecordingError
+    command_line(main, errors=(RecordingError,))

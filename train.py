@@ -60,15 +60,7 @@ from data import (
     write_text,
 )
 from maml import meta_gradient
-from model import (
-    TASK_INPUTS,
-    CheckpointError,
-    ConfigError,
-    DAMIPolicy,
-    PolicyConfig,
-    ema_model,
-    split,
-)
+from model import TASK_INPUTS, CheckpointError, DAMIPolicy, PolicyConfig, ema_model, split
 from report import Successes
 from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
 
@@ -79,8 +71,8 @@ from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulat
 class Settings:
     """What a training is made of. Each field made by `setting` is a flag.
 
-    Every checkpoint keeps all of them (`arguments`). The defaults are the paper's, whose 3000
-    epochs are of 18 outer steps each, but for the warm-up, which is DP3's.
+    Every checkpoint keeps all of them (`arguments`). The defaults are the paper's (3000
+    epochs of 18 outer steps), except for the warm-up, which is DP3's.
     """
 
     suite: str = "ml10"  # or "own", for own recordings
@@ -96,10 +88,10 @@ class Settings:
     pretrain_fraction: float = setting(
         0.0, "fraction of the steps, the first ones, without an inner step", least=0, most=1
     )
-    vectorize: int = setting(1, "tasks that run at once; memory is for so many", least=1)
-    bfloat16: bool = setting(False, "products of steps without an inner step in bfloat16")
+    vectorize: int = setting(1, "tasks that run at once; memory grows with them", least=1)
+    bfloat16: bool = setting(False, "compute steps without an inner step in bfloat16")
     after_success: int | None = setting(
-        None, "frames after its episode's first success that a window may begin", least=0
+        None, "latest start of a window, in frames after its episode's first success", least=0
     )
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
     instruction_dropout: float = setting(
@@ -109,7 +101,9 @@ class Settings:
         0.0, "fraction of the inner steps without instruction and demonstration", least=0, most=1
     )
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
-    held_out: int = setting(0, "of them, the last so many are only for measuring", least=0)
+    held_out: int = setting(
+        0, "the last demonstrations of each task, kept for measuring only", least=0
+    )
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
     episodes: int = setting(20, "evaluation episodes a task; 0: never evaluate", least=0)
@@ -119,7 +113,7 @@ class Settings:
 
     @property
     def pretrain_steps(self) -> int:
-        """So many steps, the first ones, are without an inner step."""
+        """The number of steps, at the beginning, that have no inner step."""
         return self.steps if self.maml == "off" else round(self.pretrain_fraction * self.steps)
 
 
@@ -129,10 +123,10 @@ SETTINGS = {
     "paper": Settings(),
     "small": Settings(
         preset="small", steps=10_000, support=4, query=12, lr=1e-3, warmup=100,
-        pretrain_fraction=0.8,  # a quarter of the time a step, and nearly the same gradient
-        after_success=20,  # three in five of the experts' frames are later
-        instruction_dropout=0.2,  # or the demonstration is never read
-        task_dropout=0.25, inner_lr=3e-3,  # where a step is told nothing it has all to teach
+        pretrain_fraction=0.8,  # a quarter of the time, nearly the same gradient
+        after_success=20,  # drops three fifths of the experts' frames, which are later
+        instruction_dropout=0.2,  # otherwise the policy ignores the demonstration
+        task_dropout=0.25, inner_lr=3e-3,  # without task inputs the inner step must find the task
         vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=10_000,
     ),
     "tiny": Settings(
@@ -231,8 +225,8 @@ def learning_rate(step: int, settings: Settings) -> float:
     """Linear warm-up, then half a cosine, to zero one step after the last."""
     if step < settings.warmup:
         return settings.lr * (step + 1) / settings.warmup
-    progress = (step - settings.warmup) / max(1, settings.steps - settings.warmup)  # 0 to 1
-    return settings.lr * 0.5 * (1 + math.cos(math.pi * progress))
+    done, steps = step - settings.warmup, max(1, settings.steps - settings.warmup)
+    return settings.lr * 0.5 * (1 + math.cos(math.pi * done / steps))
 
 
 @dataclass
@@ -285,12 +279,11 @@ def meta_train(
     Raises:
         UserError: the loss or its gradient is not finite. The step changed nothing then.
     """
-    policy, parameters = state.policy, dict(state.policy.named_parameters())
-    n = settings.support + settings.query
+    policy = state.policy
     my_tasks = list(enumerate(samplers))[rank::world]
 
-    # Several tasks run at once if their demonstrations have one length, and can be stacked. The
-    # shapes are then the same in every step, so on a GPU each kind of step can be one CUDA graph.
+    # Where all demonstrations have one length several tasks can run at once. As the shapes are the
+    # same in every step then, on a GPU either kind of step can also be one CUDA graph.
     lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
     vectorize = settings.vectorize if len(lengths) == 1 else 1
     without_inner_step = partial(multi_task_gradient, policy, bfloat16=settings.bfloat16)
@@ -301,10 +294,18 @@ def meta_train(
 
     for step in range(state.step, settings.steps):  # lines 2, 22
         inner = step >= settings.pretrain_steps
-        batches = [  # lines 3 to 6, 9
-            task_batch(policy, samplers[t], text[t], n, (settings.seed, step, i), settings, inner)
-            for i, t in my_tasks
-        ]
+        batches = []
+        for i, task in my_tasks:  # lines 3 to 6, 9
+            batch = task_batch(
+                policy,
+                samplers[task],
+                text[task],
+                n=settings.support + settings.query,
+                seed=(settings.seed, step, i),
+                settings=settings,
+                inner=inner,
+            )
+            batches.append(batch)
 
         # The gradient of the mean loss over my tasks
         if inner:
@@ -327,7 +328,7 @@ def meta_train(
             )
 
         # One step of AdamW, and one of the moving average, which is what is kept and rolled out
-        for name, parameter in parameters.items():
+        for name, parameter in policy.named_parameters():
             parameter.grad = gradients[name]
         state.optimizer.param_groups[0]["lr"] = lr = learning_rate(step, settings)
         state.optimizer.step()  # line 20
@@ -338,12 +339,12 @@ def meta_train(
 
 # ---- Checkpoints, and last.pt, which a run goes on from ------------------------------------------
 
-# last.pt is written every SAVE_SECONDS, which is what a killed run loses at most; but more seldom
-# where a large one is so slow that this would take more than SAVE_SHARE of the time.
+# last.pt is written every SAVE_SECONDS, so a killed run loses little more. A file that is slow to
+# write is written less often, so that writing takes at most about SAVE_SHARE of the time.
 SAVE_SECONDS = 20
 SAVE_SHARE = 0.04
 
-# These may differ when a run is resumed: they change no number, `vectorize` only its last bits.
+# These may differ when a run is resumed. Only `vectorize` changes results, in their last bits.
 FREE_TO_CHANGE = ("vectorize", "checkpoint_every", "evaluate_every", "episodes")
 OF_INNER_STEP = ("maml", "inner_lr", "task_dropout")  # may differ as long as there was none
 
@@ -366,7 +367,7 @@ def save_average(folder: Path, state: TrainingState, info: dict[str, Any]) -> No
 
 
 class Saver:
-    """Writes a run's last.pt, so often that little is lost and so rarely that it takes no time."""
+    """Writes a run's last.pt, often enough to lose little, rarely enough to cost little."""
 
     def __init__(self, path: Path, info: dict[str, Any]) -> None:
         self.path = path
@@ -406,13 +407,15 @@ def restore(
     started with other settings, or on other recordings.
     """
     policy, config = state.policy, state.policy.config
-    averaged, info = model.load(path, policy.normalizer.action_scale.device)
-    if "training" not in info:
-        raise UserError(f"{path} is no last.pt of train.py: there is no training to go on with")
+    averaged, info = model.load(
+        path,
+        policy.normalizer.action_scale.device,
+        needs=(*evaluate.TRAINED, "training", "recordings", "provenance"),
+    )
 
-    settings_then = Settings(**info["arguments"])  # what it lacks is newer, and as by default
+    settings_then = Settings(**info["arguments"])  # newer fields take their defaults
     may_differ = set(FREE_TO_CHANGE)
-    if info["step"] <= settings_then.pretrain_steps:
+    if info["step"] <= min(settings.pretrain_steps, settings_then.pretrain_steps):
         may_differ.update(OF_INNER_STEP)
     changed = []
     for now, then in ((settings, settings_then), (config, averaged.config)):
@@ -463,9 +466,9 @@ class Evaluation:
     device: torch.device
 
     def run(self, step: int, stop: StopRequest) -> Successes | None:
-        """Rolls out the checkpoint of a step and logs it, unless it was done before.
+        """Rolls out the checkpoint of a step and logs the successes, or reads them from the log.
 
-        Returns None where no evaluation is due. Everything is saved by then: Ctrl-C stops it.
+        Returns None if no evaluation is due. Ctrl-C stops it at once, since the run is saved.
         """
         settings = self.settings
         due = step == settings.steps or (step > 0 and step % settings.evaluate_every == 0)
@@ -477,10 +480,10 @@ class Evaluation:
         try:
             with stop.suspended():
                 successes = evaluate.evaluate_checkpoint(
-                    self.folder / f"ema-{step:05d}.pt",
-                    self.simulator,
-                    self.recordings,
-                    self.text,
+                    checkpoint=self.folder / f"ema-{step:05d}.pt",
+                    simulator=self.simulator,
+                    recordings=self.recordings,
+                    text=self.text,
                     episodes=settings.episodes,
                     seed=evaluate.EVALUATION_SEED,
                     workers=self.workers,
@@ -563,15 +566,9 @@ def report_training(
 
 # ---- From the command line to a run --------------------------------------------------------------
 
-OWN_FRAMES = 500  # of a demonstration on a real robot: the paper's positions there
-ARCHITECTURE = {  # fields of PolicyConfig that are flags -> what they may be
-    "policy": tuple(baselines.PRESETS),
-    "demo_encoder": (*model.demo_encoders, "none"),
-    "denoiser": tuple(model.denoisers),
-    "tcfm": ("down", "mid", "up", "none"),
-    "sampler": ("ddim", "dp3"),
-    "num_points": None,  # any number
-}
+OWN_FRAMES = 500  # learned positions for own demonstrations; the paper's number on a real robot
+# The fields of PolicyConfig that are flags
+ARCHITECTURE = ("policy", "demo_encoder", "denoiser", "tcfm", "sampler", "num_points")
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -589,12 +586,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     common.add_common_flags(group)
 
     group = parser.add_argument_group("architecture (default: the preset's)")
-    for name, choices in ARCHITECTURE.items():
+    choices = {**model.choices(), "policy": tuple(baselines.PRESETS)}
+    for name in ARCHITECTURE:
         values = {preset: getattr(config, name) for preset, config in model.PRESETS.items()}
         group.add_argument(
             common.flag_name(name),
-            type=str if choices else int,
-            choices=choices,
+            type=str if name in choices else int,
+            choices=choices.get(name),
             help="see model.PolicyConfig" + common.describe_presets(values),
         )
     group = parser.add_argument_group("settings (default: the preset's)")
@@ -626,8 +624,8 @@ def choose_architecture(args: argparse.Namespace, preset: str) -> PolicyConfig:
     config = baselines.PRESETS[args.policy or "dami"][preset]
     try:
         config = replace(config, **{name: x for name, x in flags.items() if x is not None})
-        build_empty(config)
-    except ConfigError as error:
+        model.POLICIES[config.policy].check_config(config)
+    except ValueError as error:
         raise UserError(str(error)) from error
     return config
 
@@ -658,15 +656,15 @@ def fit_to_recordings(
     Args:
         config: the architecture otherwise.
         recordings: one of each task.
-        longest: frames of a demonstration that there are positions for, at least.
-        fewer_points: whether a policy may see fewer points than `config` says, if they have fewer.
+        longest: there are learned positions for at least so many frames, before the stride.
+        fewer_points: if a recording has fewer points than `config` asks for, take its number.
     """
     first, num_points = recordings[0], config.num_points
     if fewer_points:
-        num_points = min(num_points, *(d.points.shape[1] for d in recordings))
+        num_points = min(num_points, min(d.points.shape[1] for d in recordings))
     for demonstrations in recordings:
         ends = [0, *demonstrations.episode_ends.tolist()]
-        longest = max(longest, *np.diff(ends).tolist())
+        longest = max(longest, max(np.diff(ends).tolist()))
     return replace(
         config,
         point_dim=first.points.shape[2],
@@ -761,7 +759,7 @@ def run(
         provenance: what stands beside every result.
         device, rank, world: of this process, see `join_processes`.
     """
-    # The demonstrations and their windows, which are drawn on the CPU, whatever computes
+    # The demonstrations and their windows. Windows are drawn on the CPU, whatever the device is
     recordings = {
         task: load_demonstrations(path).take(settings.demonstrations)
         for task, path in paths.items()
@@ -776,7 +774,8 @@ def run(
     data = fingerprint(train_samplers)
 
     # The policy, fresh or as it was left
-    state, text_weights = start_training(config, settings, train_samplers, device), None
+    state = start_training(config, settings, train_samplers, device)
+    text_weights = None  # any
     if args.resume:
         saved = restore(folder / "last.pt", state, settings, data)
         text_weights, provenance = saved["text_weights"], saved["provenance"]
@@ -814,8 +813,11 @@ def run(
     )
     successes = None
     with StopRequest() as stop, bar:
-        if rank == 0:
-            successes = evaluation.run(state.step, stop)  # in which a run may have been stopped
+        if rank == 0 and state.step > 0:
+            last_checkpoint = folder / f"ema-{state.step:05d}.pt"
+            if is_milestone(state.step, settings) and not last_checkpoint.exists():
+                save_average(folder, state, checkpoint_info)  # of flags that changed on --resume
+            successes = evaluation.run(state.step, stop)  # the run may have been stopped during it
         began = time.monotonic()
         for figures in meta_train(state, train_samplers, text, settings, rank=rank, world=world):
             state.seconds += time.monotonic() - began

@@ -25,6 +25,11 @@ axes.set(xlim=(0, 110), ylim=(-46, 46))
 axes.set_axis_off()
 
 
+def label(x: float, y: float, text: str, fontsize: float = 8, weight: str = "normal") -> None:
+    """Text whose middle is at (x, y)."""
+    axes.text(x, y, text, fontsize=fontsize, weight=weight, color=INK, ha="center", va="center")
+
+
 def box(
     x: float, y: float, width: float, title: str, text: str, color: str, height: float = 8
 ) -> None:
@@ -34,10 +39,10 @@ def box(
         FancyBboxPatch((x, y), width, height, boxstyle=style, facecolor=color, edgecolor=LINE)
     )
     lines = text.count("\n") + 1
-    middle, center = y + height / 2, x + width / 2
-    place = {"ha": "center", "va": "center", "color": INK}
-    axes.text(center, middle + 1.1 * lines, title, fontsize=10, weight="bold", **place)
-    axes.text(center, middle - 1.1, text, fontsize=8, **place)
+    center = x + width / 2
+    middle = y + height / 2
+    label(center, middle + 1.1 * lines, title, fontsize=10, weight="bold")
+    label(center, middle - 1.1, text)
 
 
 def panel(x: float, y: float, width: float, height: float, title: str) -> None:
@@ -52,27 +57,46 @@ def panel(x: float, y: float, width: float, height: float, title: str) -> None:
 
 
 def arrow(
-    *corners: tuple[float, float], label: str = "", at: tuple[float, float] = (0, 0), dashed=False
+    *corners: tuple[float, float],
+    text: str = "",
+    at: tuple[float, float] = (0, 0),
+    dashed: bool = False,
 ) -> None:
-    """Straight lines through the corners, the last with a head."""
-    style = {"color": LINE, "linewidth": 1.4, "linestyle": "--" if dashed else "-"}
-    axes.plot(*zip(*corners[:-1]), solid_capstyle="round", **style)
-    axes.add_patch(
-        FancyArrowPatch(*corners[-2:], arrowstyle="-|>", mutation_scale=12, shrinkA=0, **style)
+    """Straight lines through the corners, the last with a head; its text has its middle at `at`."""
+    linestyle = "--" if dashed else "-"
+    axes.plot(
+        [x for x, _ in corners[:-1]],
+        [y for _, y in corners[:-1]],
+        color=LINE,
+        linewidth=1.4,
+        linestyle=linestyle,
+        solid_capstyle="round",
     )
-    axes.text(*at, label, fontsize=8, color=INK, ha="center", va="center")
+    axes.add_patch(
+        FancyArrowPatch(
+            corners[-2],
+            corners[-1],
+            arrowstyle="-|>",
+            mutation_scale=12,
+            shrinkA=0,
+            color=LINE,
+            linewidth=1.4,
+            linestyle=linestyle,
+        )
+    )
+    label(at[0], at[1], text)
 
 
 # The network
 panel(0.5, 1, 109, 44.5, "The network")
 box(2, 31, 19, "Instruction", "one sentence", DATA)
-box(2, 18, 19, "Demonstration", "one complete episode:\n(T, N, 3), (T, S), (T, A)", DATA)
-box(2, 5, 19, "Observation", "now and just before:\n(To, N, 3), (To, S)", DATA)
+box(2, 18, 19, "Demonstration", "one complete episode:\n(T, N, P), (T, S), (T, A)", DATA)
+box(2, 5, 19, "Observation", "now and just before:\n(To, N, P), (To, S)", DATA)
 
 box(29, 31, 16, "CLIP", "text tower", FROZEN)
 box(29, 5, 16, "PointNet + MLP", "a frame to a feature,\nthe same weights\nfor both", NETWORK, 21)
 box(53, 18, 13.5, "VMT", "Transformer over\nframes and actions", NETWORK)
-box(53, 5, 13.5, "$h_k$", "MLP of the features\nand of step k", NETWORK)
+box(53, 5, 13.5, "$h_k$", "MLP of the features\nand of timestep k", NETWORK)
 box(75, 18, 13, "U2T", "$h_k$ attends to\nframes and text", NETWORK)
 box(93, 5, 15, "U-Net", "first level:\nFiLM by U2T\n(TCFM);\nothers: by $h_k$", NETWORK, 21)
 box(93, 33, 15, "Actions", "(H, A) = (16, A),\nTa executed", DATA)
@@ -80,16 +104,16 @@ box(93, 33, 15, "Actions", "(H, A) = (16, A),\nTa executed", DATA)
 arrow((21, 35), (29, 35))
 arrow((21, 22), (29, 22))
 arrow((21, 9), (29, 9))
-arrow((45, 35), (81.5, 35), (81.5, 26), label="(512)", at=(62, 36.3))
-arrow((45, 22), (53, 22), label="(T, feature)", at=(49, 25))
-arrow((45, 9), (53, 9), label="(To, feature)", at=(49, 12))
-arrow((66.5, 22), (75, 22), label="(T, demo_dim)", at=(70.7, 23.4))
-arrow((66.5, 9), (93, 9), label="(C)", at=(85, 10.4))
+arrow((45, 35), (81.5, 35), (81.5, 26), text="(512)", at=(62, 36.3))
+arrow((45, 22), (53, 22), text="(T, feature)", at=(49, 25))
+arrow((45, 9), (53, 9), text="(To, feature)", at=(49, 12))
+arrow((66.5, 22), (75, 22), text="(T, demo_dim)", at=(70.7, 23.4))
+arrow((66.5, 9), (93, 9), text="(C)", at=(85, 10.4))
 arrow((79, 9), (79, 18))
-arrow((88, 22), (93, 22), label="(C)", at=(90.5, 23.4))
-arrow((97, 26), (97, 33), label=r"$\hat A_0$", at=(95.2, 29.5))
-arrow((104, 33), (104, 26), label="next $A_k$", at=(107, 29.5))
-arrow((100.5, 1.8), (100.5, 5), label="starts from noise; k falls to 0", at=(88.5, 2.8))
+arrow((88, 22), (93, 22), text="(C)", at=(90.5, 23.4))
+arrow((97, 26), (97, 33), text=r"$\hat A_0$", at=(95.2, 29.5))
+arrow((104, 33), (104, 26), text="next $A_k$", at=(107, 29.5))
+arrow((100.5, 1.8), (100.5, 5), text="starts from noise; k falls to 0", at=(88.5, 2.8))
 
 # Meta-training
 panel(0.5, -37, 65, 36.5, "Meta-training (Algorithm 1)")
@@ -133,15 +157,10 @@ box(87, -35, 21, "Rollouts", "EMA of the adapted weights,\nnew goals", DATA)
 arrow((82.5, -13), (87, -13))
 arrow((95.5, -13), (99, -13))
 arrow(
-    (103.5, -9),
-    (103.5, -6.5),
-    (91.25, -6.5),
-    (91.25, -9.5),
-    label="200 steps of AdamW",
-    at=(97, -5),
+    (103.5, -9), (103.5, -6.5), (91.25, -6.5), (91.25, -9.5), text="200 steps of AdamW", at=(97, -5)
 )
-arrow((75.5, -27), (75.5, -22), (101, -22), (101, -17), label="start", at=(80, -20.8))
-arrow((105.5, -17), (105.5, -27), label="EMA", at=(102.8, -25))
+arrow((75.5, -27), (75.5, -22), (101, -22), (101, -17), text="start", at=(80, -20.8))
+arrow((105.5, -17), (105.5, -27), text="EMA", at=(102.8, -25))
 arrow((15, -33), (17, -33), (17, -36.2), (66.2, -36.2), (66.2, -31), (68.5, -31), dashed=True)
 
 # Legend

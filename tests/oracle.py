@@ -6,7 +6,8 @@
     python -m tests.oracle pixels train.py --suite ml10 --data data-pixels --out runs/pixels
 
 `positions`: the state also holds where the object and the goal truly are. `pixels`: the camera
-casts four times as many rays. Recordings, and checkpoints, are of one of these two.
+casts four times as many rays. Both are simulators of their own, and their recordings and
+checkpoints are of no other one.
 `augmented-twice`: scenes are turned and stretched up to twice as much in training.
 `not-averaged`: what is kept are the weights themselves, in place of their moving average.
 """
@@ -14,45 +15,81 @@ casts four times as many rays. Recordings, and checkpoints, are of one of these 
 import argparse
 import shlex
 import sys
+from dataclasses import dataclass
 from importlib import import_module
+from typing import ClassVar
 
 import numpy as np
 from torch.optim.swa_utils import AveragedModel
 
 import common
 import data
-import metaworld_env
+import simulator
 import train
 from clip import TextWeightsError
-from data import RecordingError
-from metaworld_env import MetaWorldPointCloudEnv
+from common import command_line
+from metaworld_env import (
+    CAMERA,
+    CAMERA_PIXELS,
+    CAMERA_POSITION,
+    RECIPE,
+    MetaWorld,
+    MetaWorldPointCloudEnv,
+)
 from model import CheckpointError
 
 OBJECT, GOAL = slice(4, 7), slice(-3, None)  # in what Meta-World tells its experts
 
+# ---- Simulators ----------------------------------------------------------------------------------
 
-def positions() -> None:
-    """Puts the object's and the goal's position into the state: (15,) instead of (9,)."""
-    observe = MetaWorldPointCloudEnv.observe
 
-    def observe_more(env: MetaWorldPointCloudEnv) -> dict[str, np.ndarray]:
-        observation = observe(env)
-        object_position, goal = env.expert_observation[OBJECT], env.expert_observation[GOAL]
-        state = np.concatenate([observation["agent_pos"], object_position, goal])  # (9 + 6,)
+class EnvWithPositions(MetaWorldPointCloudEnv):
+    def observe(self) -> dict[str, np.ndarray]:
+        observation = super().observe()
+        positions = [self.expert_observation[OBJECT], self.expert_observation[GOAL]]
+        state = np.concatenate([observation["agent_pos"], *positions])  # (9 + 6,)
         return {"point_cloud": observation["point_cloud"], "agent_pos": state.astype(np.float32)}
 
-    MetaWorldPointCloudEnv.observe = observe_more
-    metaworld_env.RECIPE["positions_in_state"] += 2
+
+@dataclass(frozen=True)
+class MetaWorldWithPositions(MetaWorld):
+    """The state also holds the object's and the goal's position: (15,) instead of (9,)."""
+
+    recipe: ClassVar[dict] = {**RECIPE, "positions_in_state": 5}
+
+    def make(self, task: str, num_points: int) -> EnvWithPositions:
+        return EnvWithPositions(task, num_points, episode_steps=self.episode_steps)
+
+
+@dataclass(frozen=True)
+class MetaWorldWithPixels(MetaWorld):
+    """The camera has twice as many rows and columns."""
+
+    recipe: ClassVar[dict] = {
+        **RECIPE,
+        "camera": [CAMERA, list(CAMERA_POSITION), 2 * CAMERA_PIXELS],
+    }
+
+    def make(self, task: str, num_points: int) -> MetaWorldPointCloudEnv:
+        env = super().make(task, num_points)
+        env.camera = env.make_camera(2 * CAMERA_PIXELS)
+        return env
+
+
+# ---- Worlds --------------------------------------------------------------------------------------
+
+
+def positions() -> None:
+    for suite in ("ml10", "ml45"):
+        simulator.SIMULATORS[suite] = MetaWorldWithPositions
 
 
 def pixels() -> None:
-    """Doubles the camera's rows and columns."""
-    metaworld_env.CAMERA_PIXELS *= 2
-    metaworld_env.RECIPE["camera"][2] *= 2
+    for suite in ("ml10", "ml45"):
+        simulator.SIMULATORS[suite] = MetaWorldWithPixels
 
 
 def augmented_twice() -> None:
-    """Doubles the turns and the stretch of a training's scenes."""
     data.TURN *= 2
     data.STRETCH *= 2
 
@@ -78,14 +115,11 @@ def main() -> None:
     args = parser.parse_args()
     WORLDS[args.world]()
 
-    # Results name this command, and not the one that it runs.
     provenance = common.provenance
     command = shlex.join(["python", "-m", "tests.oracle", *sys.argv[1:]])
     common.provenance = lambda *arguments: {**provenance(*arguments), "command": command}
     import_module(args.command.removesuffix(".py")).main(args.flags)
 
 
-if __name__ == "__mp_main__":  # a worker process of `main` lives in the same world
-    WORLDS[sys.argv[1]]()
 if __name__ == "__main__":
-    common.command_line(main, errors=(RecordingError, CheckpointError, TextWeightsError))
+    command_line(main, errors=(data.RecordingError, CheckpointError, TextWeightsError))

@@ -351,10 +351,9 @@ def test_an_unknown_or_contradictory_policy_is_refused_in_one_line(tmp_path):
     info = torch.load(tmp_path / "a.pt", weights_only=True)
     for config, message in (
         ({"policy": "fast"}, "policy is 'fast'; use one of dami, dp3, flow, mamba, freq"),
-        ({"demo_encoder": "vmt"}, "flow reads no task"),
-        ({"sampler": "dp3"}, "flow needs sampler ddim, not dp3"),
-        ({"policy": "freq"}, "freq needs denoiser frequency-transformer, not unet"),
-        ({"denoiser": "frequency-transformer"}, "is the denoiser of freq, not flow"),
+        ({"demo_encoder": "vmt"}, "flow needs demo_encoder 'none', not 'vmt'"),
+        ({"sampler": "dp3"}, "flow needs sampler 'ddim', not 'dp3'"),
+        ({"policy": "freq"}, "freq needs denoiser 'frequency-transformer', not 'unet'"),
     ):
         torch.save(info | {"config": info["config"] | config}, tmp_path / "b.pt")
         with pytest.raises(ValueError, match=message) as error:
@@ -411,7 +410,7 @@ def test_a_policy_is_trained_resumed_adapted_and_rolled_out(
     assert all(math.isfinite(x["loss"]) and x["loss"] != x["loss_before"] for x in losses)
     _, info = weights("run/last.pt")
     arguments = info["arguments"]
-    assert arguments["instruction_dropout"] == arguments["support_only"] == 0
+    assert arguments["instruction_dropout"] == arguments["task_dropout"] == 0
     train.main([*argv, "--out", "run", "--resume"])
 
     adapt = ["--task", "door-close", "--checkpoint", "run", "--data", str(recorded), "--out", "new"]
@@ -432,6 +431,10 @@ def test_a_policy_is_trained_resumed_adapted_and_rolled_out(
 
 def test_a_policy_that_reads_no_task_is_not_given_one(recorded, small_suite, own_folder, capsys):
     argv = [*FEW, "--data", recorded, "--out", "run", "--policy", "mamba"]
-    assert "mamba reads no task" in fails(train, [*argv, "--demo-encoder", "vmt"], capsys)
+    assert "mamba needs demo_encoder 'none', not 'vmt'" in fails(
+        train, [*argv, "--demo-encoder", "vmt"], capsys
+    )
     argv[-1] = "freq"
-    assert "freq needs sampler ddim, not dp3" in fails(train, [*argv, "--sampler", "dp3"], capsys)
+    assert "freq needs sampler 'ddim', not 'dp3'" in fails(
+        train, [*argv, "--sampler", "dp3"], capsys
+    )

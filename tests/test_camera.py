@@ -1,5 +1,6 @@
-"""Tests of camera.py against analytic scenes, Meta-World and, where it runs, OpenGL."""
+"""Tests of camera.py against `mj_ray`, analytic scenes, Meta-World and, where it runs, OpenGL."""
 
+import copy
 import subprocess
 import sys
 from pathlib import Path
@@ -8,206 +9,472 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 import metaworld_env
-from camera import FEW_RAYS, RayCastCamera, meet_ellipsoid
+from camera import RayCastCamera
 from metaworld_env import MetaWorldPointCloudEnv
 
 ROOT = Path(metaworld_env.__file__).resolve().parent
+WHOLE_IMAGE = ((-9, -9, -9), (9, 9, 9))
 
-# ---- Small scenes, and a model of another package ------------------------------------------------
 
-SCENE = """
-<mujoco><asset><material name="opaque" rgba="1 1 1 1"/></asset><worldbody>
-  <camera name="down" pos="0 0 2" fovy="60"/>
-  <camera name="turned" pos="0 0 2" mode="targetbody" target="b"/>
-  <geom type="plane" size="5 5 1"/>
-  <body name="b"><camera name="carried"/><geom type="sphere" size="0.3" pos="0.4 0.3 0.5"/></body>
-  <body><geom name="cube" type="box" size="0.2 0.2 0.2" pos="-0.5 -0.3 0.2"/></body>
-  <body><geom name="hidden by the floor" type="sphere" size="0.1" pos="0.4 -0.4 -0.3"/></body>
-  <geom type="box" size="0.2 0.2 0.2" pos="0 0 1.5" rgba="1 0 0 0" material="opaque"/>
-  <geom type="box" size="0.2 0.2 0.2" pos="0 0 1.5" group="4"/>
-  <site name="marker" type="sphere" size="0.1" pos="-0.4 0.4 0.6"/>
-  <site type="sphere" size="0.3" pos="0 0 1" rgba="1 0 0 0"/>
-</worldbody></mujoco>
+def scene(world, assets="", visual=""):
+    """A model of what is in the world and in the assets, in XML, and its data."""
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><visual>{visual}</visual><asset>{assets}</asset>"
+        f"<worldbody>{world}</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def rays_of(camera, data):
+    """Where the camera is, and its rays in the world frame."""
+    origin, axes = camera.pose(data)
+    return origin, camera.rays @ axes.T
+
+
+# ---- Against mj_ray ------------------------------------------------------------------------------
+
+
+def check_rays(camera, model, data, every=1):
+    """Compares every so many rays with `mj_ray`'s. Returns how many hit a geom."""
+    origin, rays = rays_of(camera, data)
+    rays = rays[::every]
+    groups, geom = np.uint8([1, 1, 1, 0, 0, 0]), np.empty(1, dtype=np.int32)
+    expected, geoms = np.empty(len(rays)), np.empty(len(rays), dtype=int)
+    for index, ray in enumerate(rays):
+        expected[index] = mujoco.mj_ray(model, data, origin, ray, groups, 1, -1, geom)
+        geoms[index] = geom[0]
+    expected[geoms < 0] = np.inf
+
+    distance, hit = camera.cast(data, origin, rays, camera.types)
+    on_site = hit >= model.ngeom  # of which `mj_ray` knows nothing
+    assert (distance[on_site] < expected[on_site]).all()
+    np.testing.assert_array_equal(distance[~on_site], expected[~on_site])
+    np.testing.assert_array_equal(hit[~on_site], geoms[~on_site])
+    return (geoms >= 0).sum()
+
+
+VISUAL_BOX = """
+  <body pos="0 0 0.5">
+    <geom type="box" size="0.5 0.4 0.3" contype="0" conaffinity="0"/>
+    <geom type="sphere" size="0.05" pos="0.2 0 0" group="3"/>
+  </body>
 """
+PRIMITIVES = """
+  <geom type="plane" size="1 1 1" pos="0 0 -1"/>
+  <body pos="-1 0 0" euler="20 30 0"><geom type="sphere" size="0.4"/></body>
+  <body pos="-0.5 0.7 0" euler="20 30 40"><geom type="capsule" size="0.2 0.3"/></body>
+  <body pos="0 -0.5 0" euler="20 30 80"><geom type="ellipsoid" size="0.2 0.3 0.4"/></body>
+  <body pos="0.5 0.6 0" euler="20 30 120"><geom type="cylinder" size="0.3 0.2"/></body>
+  <body pos="1 0 0" euler="20 30 160"><geom type="box" size="0.2 0.3 0.4"/></body>
+"""
+HEIGHTS = " ".join(str(3 * index % 7) for index in range(25))
+HILLS = f'<hfield name="hills" nrow="5" ncol="5" size="1 1 0.5 0.1" elevation="{HEIGHTS}"/>'
+TETRAHEDRON = '<mesh name="tetrahedron" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
+GROUPS = "".join(
+    f'<geom type="sphere" size="0.3" pos="{group / 3} 0 {group / 9}" group="{group}"/>'
+    for group in (-3, 0, 1, 2, 3, 4, 5, 7)
+)
+TRANSPARENT = """
+  <geom type="box" size="1 1 0.1" pos="0 0 1" rgba="1 0 0 0"/>
+  <geom type="box" size="0.9 0.9 0.1" pos="0 0 0.5" material="clear"/>
+  <geom type="box" size="0.4 0.4 0.1" pos="0 0 -0.5" rgba="1 0 0 0.1"/>
+"""
+CLEAR = '<material name="clear" rgba="1 1 1 0"/>'
 
 
-def scene(pixels, box, camera="down"):
-    """A camera that looks down on SCENE, and its state."""
-    model = mujoco.MjModel.from_xml_string(SCENE)
-    physics = mujoco.MjData(model)
-    mujoco.mj_forward(model, physics)
-    return RayCastCamera(model, pixels, box, camera), physics
+@pytest.mark.parametrize("position", [(2, -3, 2), (0.01, 0, 5), (-3, 0.1, 0.1)])
+@pytest.mark.parametrize(
+    "world, assets",
+    [
+        (VISUAL_BOX, ""),
+        (PRIMITIVES, ""),
+        ('<geom type="hfield" hfield="hills"/>', HILLS),
+        ('<body><geom type="mesh" mesh="tetrahedron"/></body>', TETRAHEDRON),
+        (GROUPS, ""),
+        (TRANSPARENT, CLEAR),
+    ],
+    ids=["a visual box beside a small sphere", "types", "hills", "mesh", "groups", "transparent"],
+)
+def test_distances_and_geoms_are_those_of_mj_ray(world, assets, position):
+    model, data = scene(world, assets)
+    camera = RayCastCamera(model, position=position, lookat=(0, 0, 0.1), height=50, width=60)
+    assert check_rays(camera, model, data) > 30
 
 
-def test_depth_equals_an_analytic_scene_of_plane_balls_and_cube():
-    pixels = 65
-    camera, physics = scene(pixels, ((-1, -1, 0.01), (1, 1, 1)))
-    across = np.tan(np.pi / 6) * ((np.arange(pixels) + 0.5) / pixels * 2 - 1)
-    x, y = np.meshgrid(across, -across)  # direction (x, y, -1) from (0, 0, 2): depth is parameter
-    expected = np.full((pixels, pixels), 2.0)
-    for center, radius in (((0.4, 0.3, 0.5), 0.3), ((-0.4, 0.4, 0.6), 0.1)):
+@pytest.mark.parametrize("name", ["ant", "humanoid", "half_cheetah", "pusher_v5"])
+def test_models_of_gymnasium_are_seen_as_by_mj_ray(name):
+    path = Path(gymnasium.__file__).parent / f"envs/mujoco/assets/{name}.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        data.ctrl[:] = rng.uniform(-1, 1, model.nu)
+        mujoco.mj_step(model, data)
+    middle = data.subtree_com[0]
+    camera = RayCastCamera(model, position=middle + (1, -2, 1.5), lookat=middle)
+    assert check_rays(camera, model, data, every=3) > 100
+    for index in range(model.ncam):  # those that the model has move with a body
+        assert check_rays(RayCastCamera(model, index), model, data, every=3) > 100
+
+
+@pytest.mark.parametrize("task", list(metaworld_env.INSTRUCTIONS))
+def test_every_task_is_seen_as_by_mj_ray_and_resets_to_a_cloud_inside_the_workspace(task):
+    env = MetaWorldPointCloudEnv(task, num_points=128)
+    observation, info = env.reset(seed=0)
+    assert env.observation_space.contains(observation) and info == {"success": False}
+    cloud = observation["point_cloud"]
+    assert np.isfinite(cloud).all() and len(np.unique(cloud, axis=0)) > 60
+    low, high = np.float32(metaworld_env.WORKSPACE)
+    assert (cloud >= low).all() and (cloud <= high).all()
+
+    every = 1 if task in ("hammer", "door-lock", "lever-pull") else 11
+    model, data = env.sawyer_env.model, env.sawyer_env.data
+    assert check_rays(env.camera, model, data, every) > 4000 / every
+    for _ in range(60):
+        action = env.expert_action()
+        assert env.action_space.contains(action)
+        env.advance(action)
+    assert check_rays(env.camera, model, data, every) > 4000 / every
+
+
+# ---- What is seen --------------------------------------------------------------------------------
+
+# Cameras look down from a height of 2: fixed, on a post, on a body that moves, at a body.
+BALLS = """
+  <camera name="down" pos="0 0 2" fovy="60"/>
+  <body pos="0 0 2"><camera name="on a post" fovy="60"/></body>
+  <body name="cart" pos="1 0 2" euler="0 0 90">
+    <joint name="rail" type="slide" axis="0 1 0"/>
+    <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+    <camera name="on a cart" fovy="60"/>
+  </body>
+  <camera name="at the ball" pos="2 1 2" mode="targetbody" target="ball"/>
+  <geom type="plane" size="5 5 1"/>
+  <body name="ball" pos="0.4 0.3 0.5"><geom name="ball" size="0.3" rgba="1 0 0 1"/></body>
+  <body><geom name="cube" type="box" size="0.2 0.2 0.2" pos="-0.5 -0.3 0.2"/></body>
+  <body><geom name="under the floor" type="sphere" size="0.1" pos="0.4 -0.4 -0.3"/></body>
+  <site name="marker" type="sphere" size="0.1" pos="-0.4 0.4 0.6" rgba="0 1 0 1"/>
+  <site type="sphere" size="0.3" pos="0 0 1" rgba="1 0 0 0"/>
+  <site type="sphere" size="0.3" pos="0 0 1" group="3"/>
+"""
+BALL, CUBE, MARKER = (0.4, 0.3, 0.5), (-0.5, -0.3, 0.2), (-0.4, 0.4, 0.6)
+
+
+def on_surfaces(points):
+    """Which points lie on the ball, the cube and the marker: three (M,) bool."""
+    ball = np.abs(np.linalg.norm(points - BALL, axis=1) - 0.3) < 1e-5
+    cube = np.abs(np.abs(points - CUBE).max(axis=1) - 0.2) < 1e-5
+    marker = np.abs(np.linalg.norm(points - MARKER, axis=1) - 0.1) < 1e-5
+    return ball, cube, marker
+
+
+@pytest.mark.parametrize("height, width", [(65, 65), (40, 90)])
+@pytest.mark.parametrize("free", [False, True])
+def test_depth_equals_an_analytic_scene_of_plane_balls_and_cube(height, width, free):
+    model, data = scene(BALLS, visual='<global fovy="60"/>')
+    place = {"position": (0, 0, 2), "lookat": (0, 0, 0)} if free else {"camera": "down"}
+    depth = RayCastCamera(model, **place, height=height, width=width).depth(data)
+
+    half = np.tan(np.pi / 6)  # of the image's height, a metre away
+    up = half * (1 - (np.arange(height) + 0.5) / height * 2)
+    right = half * width / height * ((np.arange(width) + 0.5) / width * 2 - 1)
+    x, y = np.meshgrid(right, up)  # direction (x, y, -1) from (0, 0, 2): depth is the parameter
+    expected = np.full((height, width), 2.0)
+    for center, radius in ((BALL, 0.3), (MARKER, 0.1)):
         a, b = x**2 + y**2 + 1, x * center[0] + y * center[1] + 2 - center[2]
         c = center[0] ** 2 + center[1] ** 2 + (2 - center[2]) ** 2 - radius**2
         with np.errstate(invalid="ignore"):
             expected = np.fmin(expected, (b - np.sqrt(b**2 - a * c)) / a)
     inner = (np.abs(1.6 * x + 0.5) < 0.2) & (np.abs(1.6 * y + 0.3) < 0.2)
     outer = (np.abs(2 * x + 0.5) < 0.32) & (np.abs(2 * y + 0.3) < 0.32)
-    sides = outer & ~inner  # left to the test of the top
-    depth = camera.depth(physics)
     expected[inner] = 1.6
+    sides = outer & ~inner  # left to the test of points
     np.testing.assert_allclose(depth[~sides], expected[~sides], atol=1e-5)
     assert (depth < 1.5).sum() > 20 and inner.sum() > 20  # balls and cube were in view at all
 
 
-def test_points_lie_on_what_the_camera_sees_of_objects_and_small_ones_get_more():
-    camera, physics = scene(40, ((-1, -1, -1), (1, 1, 0.7)))
-    points = camera.points(physics)
-    on_ball = np.abs(np.linalg.norm(points - (0.4, 0.3, 0.5), axis=1) - 0.3) < 1e-4
-    on_marker = np.abs(np.linalg.norm(points - (-0.4, 0.4, 0.6), axis=1) - 0.1) < 1e-4
-    on_cube = np.abs(np.abs(points - (-0.5, -0.3, 0.2)).max(axis=1) - 0.2) < 1e-4
-    assert (on_ball | on_marker | on_cube).all()
-    finer, few = 80, []
-    for pixels in (40, finer):
-        rays = camera.rays(pixels)
-        distance, hit = camera.cast(physics, rays)
-        low = camera.origin[2] + distance * rays[:, 2] <= 0.7
-        few.append((hit[low] < -1).sum())
-        counted = [(hit[low] == geom).sum() for geom in (3, 4)]  # ball and cube
-        if pixels == 40:
-            assert [on_ball.sum(), on_cube.sum()] == counted and min(counted) >= FEW_RAYS
-    assert few[0] < FEW_RAYS and on_marker.sum() == few[1] > 3 * few[0]
+def test_points_lie_on_what_is_seen_and_the_floor_only_hides():
+    model, data = scene(BALLS)
+    camera = RayCastCamera(model, "down", height=60, width=60)
+    points = camera.points(data)
+    assert points.dtype == np.float32
+    np.testing.assert_array_equal(np.sum(on_surfaces(points), axis=0), 1)
+    _, hit = camera.cast(data, *rays_of(camera, data), camera.types)
+    geoms = [model.geom("ball").id, model.geom("cube").id, model.ngeom + model.site("marker").id]
+    counts = [(hit == geom).sum() for geom in geoms]
+    assert [mask.sum() for mask in on_surfaces(points)] == counts and min(counts) > 5
+
+    with_floor = RayCastCamera(model, "down", height=60, width=60, background=()).points(data)
+    assert len(with_floor) == 60 * 60 and (np.abs(with_floor[:, 2]) < 1e-5).sum() > 1000
 
 
-def test_a_marker_above_the_workspace_hides_nothing_in_it():
-    camera, physics = scene(66, ((-1, -1, -1), (1, 1, 0.7)))
-    before = camera.points(physics)
-    on_marker = np.abs(np.linalg.norm(before - (-0.4, 0.4, 0.6), axis=1) - 0.1) < 1e-4
-    physics.site("marker").xpos[:] = (-0.25, -0.15, 1.2)  # halfway from the camera to the cube
-    np.testing.assert_array_equal(camera.points(physics), before[~on_marker])
+def test_only_points_in_the_box_are_returned_and_all_of_them():
+    model, data = scene(BALLS)
+    points = RayCastCamera(model, "down").points(data)
+    low, high = (-0.45, -0.45, 0.05), (0.45, 0.3, 0.55)  # cuts the ball, the cube and the marker
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    cut = RayCastCamera(model, "down", box=(low, high)).points(data)
+    np.testing.assert_array_equal(cut, points[inside])
+    assert 0 < len(cut) < len(points)
+    elsewhere = RayCastCamera(model, "down", box=((-1, -1, 3), (1, 1, 4))).points(data)
+    assert elsewhere.shape == (0, 3)
 
 
-def test_a_camera_that_could_only_be_silent_is_refused():
-    for name in ("carried", "turned"):
-        with pytest.raises(ValueError, match=f"'{name}' moves with a body"):
-            scene(8, ((-1, -1, -1), (1, 1, 1)), name)
-    with pytest.raises(ValueError, match="'down' does not see the workspace"):
-        scene(8, ((-1, -1, 3), (1, 1, 4)))
+def test_colors_and_ids_are_those_of_geoms_and_sites():
+    model, data = scene(BALLS)
+    camera = RayCastCamera(model, "down")
+    points, ids = camera.points(data, color=True, segmentation=True)
+    assert points.shape == (len(ids), 6) and points.dtype == np.float32
+    np.testing.assert_array_equal(points[:, :3], camera.points(data))
+    ball, cube, marker = on_surfaces(points[:, :3])
+    np.testing.assert_array_equal(ids[ball], model.geom("ball").id)
+    np.testing.assert_array_equal(ids[cube], model.geom("cube").id)
+    np.testing.assert_array_equal(ids[marker], model.ngeom + model.site("marker").id)
+    np.testing.assert_array_equal(points[ball, 3:], np.tile((1, 0, 0), (ball.sum(), 1)))
+    np.testing.assert_array_equal(points[cube, 3:], 0.5)
+    np.testing.assert_array_equal(points[marker, 3:], np.tile((0, 1, 0), (marker.sum(), 1)))
 
 
-def test_the_camera_sees_a_model_of_another_package():
-    path = Path(gymnasium.__file__).parent / "envs/mujoco/assets/pusher_v5.xml"
-    spec = mujoco.MjSpec.from_file(str(path))
-    spec.worldbody.add_camera(name="above", pos=(0.45, -0.05, 1.5))  # it looks down
-    model = spec.compile()
-    physics = mujoco.MjData(model)
-    mujoco.mj_forward(model, physics)
-    box = ((-0.3, -0.8, -0.4), (1.2, 0.7, 0.5))
-    camera = RayCastCamera(model, pixels=64, box=box, camera="above")
-    points = camera.points(physics)
-    middle, radius = physics.body("object").xpos, model.geom(model.body("object").geomadr[0]).size
-    on_object = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < radius[0] + 1e-6
-    assert 20 < on_object.sum() < len(points)  # the puck, and the arm
-
-    arm = [model.body(i).name for i in range(model.nbody) if model.body(i).name.startswith("r_")]
-    camera = RayCastCamera(model, pixels=64, box=box, camera="above", arm=arm)
-    objects, of_arm = camera.points(physics), camera.arm_points(physics)
-    np.testing.assert_allclose(objects, points[np.isin(points, objects).all(axis=1)])
-    assert len(of_arm) > 50 and not np.isin(of_arm, objects).all(axis=1).any()
+MATERIALS = """
+  <texture name="half" type="2d" builtin="checker" width="64" height="64" rgb2="0 0 1"
+    rgb1="1 1 1"/>
+  <material name="opaque" rgba="0 1 0 1"/>
+  <material name="clear" rgba="0 1 0 0"/>
+  <material name="checker" texture="half" rgba="1 1 1 1"/>
+"""
 
 
-def test_a_camera_inside_an_ellipsoid_looks_through_it():
-    rays, half = np.eye(3), np.array([0.1, 0.2, 0.3])
-    for center in ((0.05, 0, 0), (1.0, 0, 0)):
-        distance = meet_ellipsoid(np.zeros(3), rays, np.array(center), np.eye(3), half)
-        expected = [0.9 if center[0] == 1 else np.inf, np.inf, np.inf]
-        np.testing.assert_allclose(distance, expected)
+def test_a_geoms_own_color_goes_before_its_materials_as_in_mujocos_renderer():
+    world = """
+      <camera name="down" pos="0 0 3"/>
+      <body>
+        <geom type="box" size="0.2 0.2 0.2" pos="-0.5 0 0" material="opaque"/>
+        <geom type="box" size="0.2 0.2 0.2" pos="-0.5 0 0.5" material="opaque" rgba="1 0 0 0"/>
+        <geom type="box" size="0.2 0.2 0.2" pos="0 0 0" material="clear" rgba="1 0 0 1"/>
+        <geom type="box" size="0.2 0.2 0.2" pos="0.5 0 0" material="checker"/>
+      </body>"""
+    model, data = scene(world, MATERIALS)
+    points, ids = RayCastCamera(model, "down").points(data, color=True, segmentation=True)
+    colors = {int(geom): points[ids == geom, 3:].mean(axis=0) for geom in np.unique(ids)}
+    assert set(colors) == {0, 2, 3}  # the second is not drawn, though `mj_ray` meets it
+    np.testing.assert_allclose(colors[0], (0, 1, 0))
+    np.testing.assert_allclose(colors[2], (1, 0, 0))
+    np.testing.assert_allclose(colors[3], (0.5, 0.5, 1), atol=0.02)
 
 
-def test_the_file_alone_in_an_empty_folder_makes_a_cloud(tmp_path):
+@pytest.mark.parametrize(
+    "shape",
+    [
+        'type="sphere" size="0.3"',
+        'type="capsule" size="0.1 0.3"',
+        'type="ellipsoid" size="0.1 0.2 0.3"',
+        'type="cylinder" size="0.2 0.3"',
+        'type="box" size="0.1 0.2 0.3"',
+    ],
+)
+def test_a_site_looks_like_a_geom_of_its_shape_unless_sites_are_not_to_be_seen(shape):
+    body = '<body pos="0.1 0 0" euler="10 20 30">{}</body><camera name="down" pos="0 0 3"/>'
+    model, data = scene(body.format(f"<site {shape}/>"))
+    geom_model, geom_data = scene(body.format(f"<geom {shape}/>"))
+    depth = RayCastCamera(model, "down").depth(data)
+    np.testing.assert_array_equal(depth, RayCastCamera(geom_model, "down").depth(geom_data))
+    assert np.isfinite(depth).sum() > 50
+    assert np.isinf(RayCastCamera(model, "down", sites=False).depth(data)).all()
+
+
+def test_groups_can_be_chosen():
+    model, data = scene(GROUPS + '<camera name="side" pos="0 -5 0" xyaxes="1 0 0 0 0 1"/>')
+    camera = RayCastCamera(model, "side", groups=(0, 5), background=())
+    _, ids = camera.points(data, segmentation=True)
+    seen = {int(group) for group in model.geom_group[np.unique(ids)]}
+    assert seen == {-3, 0, 5, 7}  # MuJoCo counts what is beyond 0 to 5 as these
+
+
+# ---- Where the camera is -------------------------------------------------------------------------
+
+
+def test_cameras_on_a_post_on_a_cart_and_at_a_body_see_from_where_they_are():
+    model, data = scene(BALLS)
+    down = RayCastCamera(model, "down").depth(data)
+    post = RayCastCamera(model, "on a post")
+    np.testing.assert_allclose(post.depth(data), down, atol=1e-12)
+
+    cart, ball = RayCastCamera(model, "on a cart"), RayCastCamera(model, "at the ball")
+    counts = []
+    for shift in (0, 0.5, 1):  # the cart turned a quarter: its y is the world's -x
+        data.joint("rail").qpos = shift
+        mujoco.mj_forward(model, data)
+        surfaces = on_surfaces(cart.points(data))
+        np.testing.assert_array_equal(np.sum(surfaces, axis=0), 1)
+        counts.append(np.sum(surfaces, axis=1).tolist())
+    assert counts[0] != counts[1]
+    same = np.isclose(cart.depth(data), np.rot90(down, -1))  # now it is above the middle
+    assert same.mean() > 0.999  # an edge may fall on either side
+
+    middle = ball.depth(data)[42, 42]  # of 84: half a pixel beside the middle
+    assert middle == pytest.approx(np.linalg.norm(np.subtract((2, 1, 2), BALL)) - 0.3, abs=1e-2)
+    assert on_surfaces(ball.points(data))[0].sum() > 50
+
+
+def test_a_free_camera_is_upright_and_its_middle_is_what_it_looks_at():
+    world = """
+      <body><geom type="sphere" size="0.1" pos="1 2 3"/></body>
+      <body><geom type="sphere" size="0.1" pos="1 2 3.5"/></body>"""
+    model, data = scene(world)
+    for position in ((4, 2, 3), (1, -2, 5), (-2, 3, 1)):
+        camera = RayCastCamera(model, position=position, lookat=(1, 2, 3), height=101, width=101)
+        _, hit = camera.cast(data, *rays_of(camera, data), camera.types)
+        rows, columns = np.nonzero(hit.reshape(101, 101) == 0)
+        np.testing.assert_allclose((rows.mean(), columns.mean()), 50, atol=0.5)
+        rows, columns = np.nonzero(hit.reshape(101, 101) == 1)
+        assert rows.mean() < 40 and abs(columns.mean() - 50) < 0.5
+
+
+def test_the_model_of_the_caller_is_left_as_it_was():
+    env = MetaWorldPointCloudEnv("reach")
+    env.begin(0)
+    model, data = env.sawyer_env.model, env.sawyer_env.data
+
+    def everything():
+        buffer = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
+        mujoco.mj_saveModel(model, None, buffer)
+        return buffer
+
+    before = everything()
+    camera = RayCastCamera(model, "corner2", ellipsoids=("right_l4",), groups=(0,))
+    camera.points(data)
+    camera.depth(data)
+    camera.render(data, 8, 8)
+    np.testing.assert_array_equal(everything(), before)
+
+
+# ---- What is refused -----------------------------------------------------------------------------
+
+LENS = 'sensorsize="0.01 0.01" focal="0.01 0.01" resolution="10 10"'
+CLOTH = """
+  <flexcomp name="cloth" type="grid" count="3 3 1" spacing="0.2 0.2 0.2" dim="2" {}>
+    <edge equality="true"/>
+  </flexcomp>"""
+
+
+@pytest.mark.parametrize(
+    "world, arguments, message",
+    [
+        ('<camera name="a" orthographic="true"/>', {"camera": "a"}, "an orthographic camera"),
+        (f'<camera name="a" {LENS}/>', {"camera": "a"}, "'a' has a lens of its own"),
+        ('<camera name="a"/>', {}, "give either a camera"),
+        ('<camera name="a"/>', {"camera": "a", "position": (0, 0, 1)}, "give either a camera"),
+        ("", {"position": (0, 0, 1)}, "give either a camera"),
+        ("", {"position": (0, 0, 1), "lookat": (0, 0, 1)}, "cannot look at that same point"),
+        ('<camera name="a"/>', {"camera": "a", "box": ((0, 0, 1), (1, 1, 1))}, "the box is empty"),
+        (CLOTH.format("") + '<camera name="a"/>', {"camera": "a"}, "rays do not meet a flex"),
+    ],
+)
+def test_what_could_only_be_seen_wrongly_is_refused(world, arguments, message):
+    model, _ = scene(world)
+    with pytest.raises(ValueError, match=message):
+        RayCastCamera(model, **arguments)
+
+
+def test_an_orthographic_view_of_the_free_camera_is_refused():
+    model, _ = scene("", visual='<global orthographic="true"/>')
+    with pytest.raises(ValueError, match="an orthographic camera"):
+        RayCastCamera(model, position=(0, 0, 1), lookat=(0, 0, 0))
+
+
+def test_a_skin_is_refused_and_a_flex_that_is_not_drawn_is_not():
+    skin = """
+      <skin name="skin" vertex="0 0 0 1 0 0 0 1 0" face="0 1 2">
+        <bone body="b" bindpos="0 0 0" bindquat="1 0 0 0" vertid="0 1 2" vertweight="1 1 1"/>
+      </skin>"""
+    world = '<camera name="a"/><body name="b"><geom size="1"/></body>'
+    xml = f"<mujoco><worldbody>{world}</worldbody><deformable>{skin}</deformable></mujoco>"
+    with pytest.raises(ValueError, match="rays do not meet a skin"):
+        RayCastCamera(mujoco.MjModel.from_xml_string(xml), "a")
+    for unseen in ('group="3"', 'rgba="1 0 0 0"'):
+        model, data = scene(CLOTH.format(unseen) + world)
+        assert len(RayCastCamera(model, "a").points(data)) > 0
+
+
+def test_data_without_poses_or_of_another_model_is_refused():
+    model, _ = scene(BALLS)
+    camera = RayCastCamera(model, "down")
+    with pytest.raises(ValueError, match=r"call mujoco\.mj_forward"):
+        camera.points(mujoco.MjData(model))
+    with pytest.raises(ValueError, match="of another model"):
+        camera.points(scene(PRIMITIVES)[1])
+    with pytest.raises(KeyError, match="Invalid name 'dawn'"):
+        RayCastCamera(model, "dawn")
+    with pytest.raises(KeyError, match="Invalid name 'table'"):
+        RayCastCamera(model, "down", background=("table",))
+
+
+# ---- The file alone ------------------------------------------------------------------------------
+
+# README shows these lines.
+ANT = """\
+import gymnasium
+import matplotlib.pyplot as plt
+
+from camera import RayCastCamera
+
+ant = gymnasium.make("Ant-v5").unwrapped
+ant.reset(seed=0)
+points = RayCastCamera(ant.model, position=(2, -2, 2), lookat=(0, 0, 0.7)).points(ant.data)
+plt.axes(projection="3d", box_aspect=points.max(0) - points.min(0)).scatter(*points.T)
+plt.savefig("ant.png")
+"""
+
+
+def test_the_file_alone_in_an_empty_folder_draws_a_cloud_of_gymnasiums_ant(tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    readme = (ROOT / "README.md").read_text()
+    assert "RayCastCamera(" not in readme or ANT in readme
     (tmp_path / "camera.py").write_text((ROOT / "camera.py").read_text())
-    (tmp_path / "scene.xml").write_text(SCENE)
-    command = [sys.executable, "-I", "-c", ALONE, str(tmp_path)]
+    lines = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\n{ANT}print(len(points))"
+    command = [sys.executable, "-I", "-c", lines]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) > 100
+    assert int(done.stdout) > 400
+    picture = (tmp_path / "ant.png").read_bytes()
+    assert picture.startswith(b"\x89PNG") and len(picture) > 20_000
 
-
-ALONE = """
-import sys
-sys.path.insert(0, sys.argv[1])
-import mujoco
-from camera import RayCastCamera
-model = mujoco.MjModel.from_xml_path("scene.xml")
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-camera = RayCastCamera(model, pixels=40, box=((-1, -1, -1), (1, 1, 1)), camera="down")
-print(len(camera.points(data)))
-"""
 
 # ---- Meta-World's scenes -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", ["hand-insert", "door-open"])
-def test_points_are_what_rays_meet_first_and_nothing_is_left_out(task):
-    env = MetaWorldPointCloudEnv(task)
-    env.begin(1)
-    for _ in range(40):
-        env.advance(env.expert_action())
-    model, physics = env.sawyer_env.model, env.sawyer_env.data
-    camera = RayCastCamera(
-        model,
-        pixels=84,
-        box=metaworld_env.WORKSPACE,
-        camera=metaworld_env.CAMERA,
-        position=metaworld_env.CAMERA_POSITION,
-    )  # the arm is not declared: its exact shape is seen
-    points = camera.points(physics)
-    away = np.linalg.norm(points - camera.origin, axis=1)
-    distance, hit = camera.cast(physics, (points - camera.origin) / away[:, None])
-    np.testing.assert_allclose(distance, away, atol=1e-5)  # nothing is before them
-    assert ((hit < -1) | ~camera.background_geoms[hit]).all()
-
-    rays = camera.rays(84)
-    distance, hit = camera.cast(physics, rays)
-    seen = (hit < -1) | ((hit >= 0) & ~camera.background_geoms[hit])
-    every = camera.origin + distance[seen, None] * rays[seen]
-    every = every[((every >= camera.low) & (every <= camera.high)).all(axis=1)]
-    apart = cKDTree(points).query(every)[0]
-    assert np.median(apart) < 1e-6 and np.quantile(apart, 0.99) < 0.01  # a pixel is a centimetre
-
-
-def test_ellipsoids_hide_what_the_arm_hides():
-    """Their outline differs: 0.86 of what both cover is common, where the depth is 1 cm off."""
+def test_ellipsoids_stand_in_for_the_arms_meshes_in_clouds_alone():
+    """Their outlines share 0.85 of what either covers; the depth there is 14 mm off, the median."""
     env = MetaWorldPointCloudEnv("reach")
-    camera, common, either, apart = env.camera, 0, 0, []
-    links = np.isin(np.arange(camera.model.ngeom), camera.arm_geoms)
+    model, data = copy.copy(env.sawyer_env.model), env.sawyer_env.data
+    others = ~np.isin(np.arange(model.ngeom), env.arm_geoms)
+    model.geom_group[others] = 3  # the arm alone
+    camera = RayCastCamera(
+        model, metaworld_env.CAMERA, sites=False, ellipsoids=metaworld_env.ARM_LINKS
+    )
+    common, either, apart = 0, 0, []
     for seed in range(4):
         env.begin(seed)
         for _ in range(30 * seed):
             env.advance(env.expert_action())
-        rays, physics = camera.workspace_rays, env.sawyer_env.data
-        exact, _ = camera.cast(physics, rays, geoms=links, sites=())
-        rough = camera.cast_at_arm(physics, rays)
+        origin, rays = rays_of(camera, data)
+        exact, _ = camera.cast(data, origin, rays, camera.types)
+        rough, _ = camera.cast(data, origin, rays, camera.cloud_types)
         both = np.isfinite(exact) & np.isfinite(rough)
         common += both.sum()
         either += (np.isfinite(exact) | np.isfinite(rough)).sum()
         apart.extend(np.abs(exact[both] - rough[both]))
-    assert common / either > 0.82 and np.median(apart) < 0.013
 
-
-def test_what_stands_still_is_met_once_an_episode():
-    env = MetaWorldPointCloudEnv("shelf-place")
-    met = []
-    for seed in (0, 1):  # each puts the shelf elsewhere
-        env.begin(seed)
-        for _ in range(3):
-            env.cloud()
-            met.append(env.camera.static_hits)
-            env.advance(env.expert_action())
-    assert met[0] is met[1] is met[2] is not met[3] is met[4] is met[5]
+        points = camera.points(data)
+        points_expected = (origin + rough[:, None] * rays)[np.isfinite(rough)]
+        np.testing.assert_allclose(points, points_expected, atol=1e-6)
+        depth = (exact * -camera.rays[:, 2]).reshape(84, 84)
+        np.testing.assert_array_equal(camera.depth(data), depth)
+    assert 0.8 < common / either < 0.95 and 0.001 < np.median(apart) < 0.02
 
 
 RASTERIZE = """

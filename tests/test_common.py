@@ -264,7 +264,7 @@ def sleep_or_fail(seconds):
     "job, jobs, setup, error, message",
     [
         (exit_at_once, [{"code": 1}], None, UserError, "killed, perhaps for memory"),
-        (sleep_or_fail, [{"seconds": 60}, {"seconds": "long"}], None, ValueError, "long"),
+        (sleep_or_fail, [{"seconds": 600}, {"seconds": "long"}], None, ValueError, "long"),
         (
             sleep_or_fail,
             [{"seconds": 0}],
@@ -279,7 +279,7 @@ def test_a_fault_in_one_process_ends_all(job, jobs, setup, error, message, capfd
     start = time.monotonic()
     with pytest.raises(error, match=message):
         run_jobs(job, jobs, workers=2, total=len(jobs), description="failing", setup=setup)
-    assert time.monotonic() - start < 30 and not multiprocessing.active_children()
+    assert time.monotonic() - start < 500 and not multiprocessing.active_children()
     assert "Traceback" not in capfd.readouterr().err
     assert signal.getsignal(signal.SIGINT) is handler  # Ctrl-C works again
 
@@ -323,7 +323,7 @@ def test_ctrl_c_or_a_kill_while_workers_import_leaves_no_process_and_no_tracebac
         command, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
-        _, error = process.communicate(timeout=30)  # until the last process closes its stderr
+        _, error = process.communicate(timeout=120)  # until the last process closes its stderr
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)

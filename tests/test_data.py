@@ -323,7 +323,7 @@ BAD_PARTS = [
     (NO_FRAMES, "holds no episodes"),
     ({"action": np.zeros((30, 4), ">f4")}, "action must be 2-dimensional"),
     ({"action": np.zeros((30, 4), np.longdouble)}, "action must be 2-dimensional"),
-    ({"state": np.full((30, 9), 1e35)}, "state holds NaN or infinite numbers"),
+    ({"state": np.full((30, 9), 1e35)}, "state holds NaN, infinite or huge numbers"),
     ({"points": np.full((30, 16, 3), 900, np.float16)}, "write them in metres"),
     ({"task": "re\0ach"}, "is no name"),
     *(

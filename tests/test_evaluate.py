@@ -4,6 +4,7 @@ Most roll out in toy_simulator.py, which takes milliseconds, and without other p
 """
 
 import json
+import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -495,13 +496,13 @@ def test_the_best_checkpoints_of_a_run_are_averaged(run, recordings, monkeypatch
         return {task: [checkpoint.stem == "ema-00003", True] for task in recordings}
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
-    evaluate.main(command(run, recordings, "--episodes 2 --top 2 --out report"))
+    evaluate.main(command(run, recordings, "--episodes 2 --top 1 --out report"))
     written = report_of("report")
     assert written["provenance"]["mean, last checkpoint"] == "50.0 (one run)"
-    assert written["provenance"]["mean, best 2 checkpoints"] == "75.0 (one run)"
+    assert written["provenance"]["mean, best 1 checkpoints"] == "100.0 (one run)"
     assert list(written["successes"]) == ["toy-tiny-seed0/ema-00006"]
     assert len(written["checkpoints"]) == 2
-    assert "best 2 checkpoints" in capsys.readouterr().out
+    assert "best 1 checkpoints" in capsys.readouterr().out
 
 
 def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordings, monkeypatch):
@@ -538,6 +539,51 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordi
     provenance = report_of("without")["provenance"]
     assert provenance["left out"] == "demonstration and instruction"
     assert provenance["n_action_steps"] == 4 and "sampler" not in provenance
+
+
+def test_what_the_command_line_says_reaches_the_rollouts(run, recordings, trained, monkeypatch):
+    calls = []
+
+    def measured(checkpoint, recordings, text, **options):
+        calls.append((checkpoint, list(recordings), text, options))
+        return {task: [True] for task in recordings}
+
+    monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
+    flags = "--task touch-green --known-goals --seed 3 --episodes 4 --workers 2 --sampler ddim"
+    evaluate.main(command(run, recordings, flags))
+    [(checkpoint, tasks, text, options)] = calls
+    assert checkpoint == run / "ema-00006.pt" and tasks == ["touch-green"]
+    assert torch.equal(text["touch-green"], features(tasks, None, None)[0][0])
+    assert isinstance(options.pop("simulator"), ToySimulator)
+    assert options == {
+        "episodes": 4,
+        "seed": 3,
+        "workers": 2,
+        "device": torch.device("cpu"),
+        "n_demonstrations": 2,
+        "zero_demonstration": False,
+        "known_goals": True,
+        "config_overrides": {"sampler": "ddim"},
+    }
+    provenance = report_of("runs/evaluation")["provenance"]
+    assert provenance["goals"] == "of the demonstrations, each once"
+    assert provenance["sampler"] == "ddim" and provenance["title"] == "touch-green"
+
+
+def test_a_policy_that_was_adapted_without_its_instruction_is_not_given_one(
+    trained, recordings, monkeypatch
+):
+    texts = []
+
+    def measured(checkpoint, recordings, text, **_):
+        texts.extend(text.values())
+        return {task: [True] for task in recordings}
+
+    monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
+    info = {**INFO, "adapted_to": "touch-blue", "adaptation": {"instruction": False}}
+    model.save("adapted.pt", trained, **info)
+    evaluate.main(command("adapted.pt", recordings))
+    assert len(texts) == 1 and not texts[0].any()
 
 
 def test_a_run_of_another_policy_stands_beside_that_policys_published_numbers(
@@ -738,6 +784,27 @@ def test_a_checkpoint_that_cannot_be_measured_so_is_refused(
 def test_without_any_policy_the_user_is_told_how_to_make_one(monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "SHIPPED_CHECKPOINT", Path("none.pt"))
     assert "no finished run on ml10 in runs/: train one" in fails(evaluate, [], capsys)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ("--checkpoint damaged.pt", "damaged.pt is damaged or no PyTorch checkpoint"),
+        ("--data damaged", "touch-red.npz"),
+        ("--clip-weights none.pt", "none.pt: there is no such file"),
+    ],
+)
+def test_the_script_says_of_damaged_files_what_they_are(
+    run, recordings, options, message, monkeypatch, capsys
+):
+    Path("damaged.pt").write_bytes(b"x")
+    Path("damaged").mkdir()
+    Path("damaged/touch-red.npz").write_bytes(b"x")
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *command(run, recordings, options)])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(evaluate.__file__, run_name="__main__")
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and error.startswith("error: ") and message in error
 
 
 def test_a_programmers_mistake_keeps_its_traceback(run, recordings, monkeypatch):

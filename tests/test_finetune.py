@@ -54,8 +54,8 @@ def evaluated(monkeypatch, successes):
     """Puts `successes(checkpoint)` in the place of rollouts; returns the list of calls to come."""
     calls = []
 
-    def evaluate_checkpoint(checkpoint, simulated_in, recordings, text, **options):
-        calls.append({"text": text, **options})
+    def evaluate_checkpoint(*, checkpoint, recordings, **options):
+        calls.append(options)
         return {task: successes(checkpoint) for task in recordings}
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", evaluate_checkpoint)

@@ -259,7 +259,7 @@ LAYERS = [  # what PyTorch gets wrong stands first
     (lambda: nn.MaxPool2d(2), IMAGE),
     (lambda: nn.AvgPool1d(2), SEQUENCE),
     (lambda: nn.AdaptiveMaxPool2d(2), IMAGE),
-    (lambda: nn.LPPool1d(3, 2), SEQUENCE),
+    (lambda: nn.LPPool1d(2, 2), SEQUENCE),
     (lambda: nn.Upsample(scale_factor=2, mode="bicubic"), IMAGE),
 ]
 # fmt: on
@@ -274,7 +274,7 @@ def both_ways(layer, shape):
             parameter += 0.3 * torch.randn_like(parameter)
     params = {name: p.detach() for name, p in layer.named_parameters()}
     params["scale"] = torch.randn(shape[1:], dtype=torch.float64)
-    tasks = list(torch.randn(3, 2, *shape, dtype=torch.float64))
+    tasks = [tuple(pair) for pair in torch.randn(3, 2, *shape, dtype=torch.float64)]
 
     def loss(params, x):
         weights = {name: p for name, p in params.items() if name != "scale"}
@@ -293,7 +293,7 @@ def test_a_layer_of_torch_has_the_same_meta_gradient_with_and_without_vmap(make,
 
 @pytest.mark.parametrize("options", [{"padding_idx": 0}, {"scale_grad_by_freq": True}])
 def test_an_embedding_that_vmap_gets_wrong_is_refused(options):
-    with pytest.raises(NotImplementedError, match="derivatives of embedding.*use vectorize=1"):
+    with pytest.raises(NotImplementedError, match=r"embedding, .* use vectorize=1"):
         both_ways(Tokens(nn.Embedding(10, 8, **options)), SEQUENCE)
 
 
@@ -302,7 +302,7 @@ def test_a_function_beneath_the_layers_is_refused_as_well():
         def forward(self, x):
             return torch.layer_norm(x, (8,), x[0, 0])
 
-    with pytest.raises(NotImplementedError, match="derivatives of layer_norm"):
+    with pytest.raises(NotImplementedError, match=r"layer_norm, .* use vectorize=1"):
         both_ways(Direct(), SEQUENCE)
 
 

@@ -109,7 +109,11 @@ def sample(policy, batch, seed=0):
         ({"point_dim": 2}, ("point_dim", "2", "3")),
         ({"denoiser": "mlp"}, ("mlp", "unet")),
         ({"unet_widths": ()}, ("unet_widths", "()")),
-        ({"pointnet_widths": (64, 0)}, ("pointnet_widths", "0", "1")),
+        ({"pointnet_widths": (64, 0)}, ("pointnet_widths", "(64, 0)", "1")),
+        ({"pointnet_widths": (64, 0.5)}, ("pointnet_widths", "0.5")),
+        ({"unet_widths": (2**20, 2**21)}, ("unet_widths", "100000")),
+        ({"state_dim": "x"}, ("state_dim", "'x'")),
+        ({"horizon": 0}, ("horizon", "0", "1")),
         ({"u2t_layers": 100}, ("u2t_layers", "100", "99")),
         ({"timestep_dim": 31}, ("timestep_dim", "31", "even")),
         ({"tcfm": "left"}, ("left", "mid")),
@@ -631,9 +635,9 @@ def test_a_policys_class_refuses_the_configuration_of_another():
     flow = baselines.PRESETS["flow"]["tiny"]
     with pytest.raises(ValueError, match="policy 'flow' is a FlowPolicy and no DAMIPolicy"):
         DAMIPolicy(flow)
-    with pytest.raises(ValueError, match="flow reads no task"):
+    with pytest.raises(ValueError, match="policy flow needs demo_encoder 'none', not 'vmt'"):
         model.build_policy(replace(flow, demo_encoder="vmt"))
-    with pytest.raises(ValueError, match="freq needs denoiser frequency-transformer, not unet"):
+    with pytest.raises(ValueError, match="freq needs denoiser 'frequency-transformer', not 'unet'"):
         model.build_policy(replace(baselines.PRESETS["freq"]["tiny"], denoiser="unet"))
 
 
@@ -662,6 +666,22 @@ def test_a_new_network_is_a_class_and_a_line(monkeypatch, tmp_path):
     assert torch.equal(sample(again, batch), sample(policy, batch))
     diffusion = set(policy.parameter_groups()["diffusion"])
     assert set(policy.denoiser.parameters()) < diffusion
+
+
+def test_a_mistake_in_a_network_keeps_its_own_error_when_a_checkpoint_is_loaded(
+    monkeypatch, tmp_path
+):
+    monkeypatch.setitem(model.denoisers, "toy", ToyDenoiser)
+    model.save(tmp_path / "toy.pt", new_policy(denoiser="toy"))
+
+    def broken(config):
+        height, width = config.unet_widths, config.horizon, config.action_dim
+        return height, width
+
+    monkeypatch.setitem(model.denoisers, "toy", broken)
+    with pytest.raises(ValueError, match="too many values to unpack") as error:
+        model.load(tmp_path / "toy.pt")
+    assert not isinstance(error.value, CheckpointError)
 
 
 # ---- Checkpoints ---------------------------------------------------------------------------------
@@ -729,9 +749,9 @@ def bad_checkpoints(folder, good):
         "foreign": "holds no policy",
         "list": "holds no policy",
         "old": "written by an older version of this code: train again, or use that version",
-        "shape": "do not fit",
+        "shape": "do not fit: denoiser.down.0.0.conv1.0.weight is (16, 4, 5) in the file, and (32,",
         "newer": "flavor",
-        "headless": "do not fit",
+        "headless": "its model is missing",
     }
 
 

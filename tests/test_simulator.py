@@ -16,7 +16,7 @@ from toy_simulator import ToyEnvironment, ToySimulator
 
 import simulator
 from common import UserError, command_line
-from data import load_demonstrations, save_demonstrations
+from data import RecordingError, load_demonstrations, save_demonstrations
 from metaworld_env import MetaWorld
 from simulator import collect, demonstration_seed, evaluation_seed, made_by_simulator
 
@@ -133,6 +133,13 @@ def test_a_recording_is_what_the_expert_saw_and_did(recording):
             np.testing.assert_array_equal(recorded.action[frame], env.expert_action())
             success.append(env.advance(recorded.action[frame])[2]["success"])
         assert success.index(True) == recorded.meta["success_frames"][index] > 0
+
+
+def test_points_keep_their_colours(tmp_path):
+    path = tmp_path / "touch-green.npz"
+    simulator.collect_task(ToySimulator(colored=True), path.stem, path, episodes=1, seed=0)
+    points = load_demonstrations(path).points
+    assert points.shape == (12, 64, 6) and (points[..., 3:] == (0, 1, 0)).all()
 
 
 class HardEnvironment(ToyEnvironment):
@@ -281,6 +288,6 @@ def test_what_the_user_gets_wrong_ends_in_one_line_and_exit_code_2(
     Path("damaged").mkdir()
     Path("damaged/reach.npz").write_text("no recording")
     with pytest.raises(SystemExit) as end:
-        command_line(lambda: simulator.main(argv), errors=(ValueError,))
+        command_line(lambda: simulator.main(argv), errors=(RecordingError,))
     error = capsys.readouterr().err
     assert end.value.code == 2 and message in error and error.count("\n") == 1

@@ -421,7 +421,7 @@ def test_ctrl_c_saves_says_how_to_resume_and_ends_with_130(
 def test_a_run_stopped_while_it_is_evaluated_is_evaluated_when_resumed(
     bowl, tmp_path, monkeypatch, capsys
 ):
-    def stopped(*_, **__):
+    def stopped(**_):
         signal.raise_signal(signal.SIGINT)
 
     out, argv = tmp_path / "run", [*bowl, "--evaluate-every", "6", "--out", str(tmp_path / "run")]
@@ -433,15 +433,15 @@ def test_a_run_stopped_while_it_is_evaluated_is_evaluated_when_resumed(
 
     successes, asked = {"pour": [True, False], "stir": [True, True]}, []
 
-    def evaluated(*arguments, **options):
-        asked.append((arguments, options))
+    def evaluated(**options):
+        asked.append(options)
         return successes
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", evaluated)
     train.main([*argv, "--resume"])
-    [((checkpoint, simulated_in, paths, text), options)] = asked
-    assert checkpoint == out / "ema-00006.pt" and isinstance(simulated_in, Bowl)
-    assert list(paths) == list(text) == ["pour", "stir"]
+    [options] = asked
+    assert options["checkpoint"] == out / "ema-00006.pt" and isinstance(options["simulator"], Bowl)
+    assert list(options["recordings"]) == list(options["text"]) == ["pour", "stir"]
     assert options["episodes"] == 2 and options["n_demonstrations"] == 2 and options["seed"] == 0
     written = json.loads((out / "success.json").read_text())
     assert written["successes"]["last checkpoint"] == successes
@@ -453,7 +453,7 @@ def test_a_run_stopped_while_it_is_evaluated_is_evaluated_when_resumed(
 def test_a_run_is_evaluated_and_resumed_where_it_was_asked_for(bowl, monkeypatch, capsys):
     evaluated = []
 
-    def evaluate_and_stop(checkpoint, *_, **__):
+    def evaluate_and_stop(checkpoint, **_):
         evaluated.append(checkpoint.stem)
         if evaluated == ["ema-00002"]:
             signal.raise_signal(signal.SIGINT)
@@ -661,7 +661,7 @@ def test_what_cannot_be_resumed_is_said(pair, finished, tmp_path, capsys):
     out.mkdir()
     shutil.copy(finished / "ema-00003.pt", out / "last.pt")
     message = fails(train, [*argv, "--out", out, "--resume"], capsys)
-    assert "no training to go on with" in message
+    assert "last.pt lacks training, recordings" in message
     (out / "last.pt").rename(out / "ema-00003.pt")
     assert "already holds a run" in fails(train, [*argv, "--out", out], capsys)
     with common.locked(tmp_path / "busy"):
@@ -788,13 +788,12 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("options", REFUSED)
-def test_a_mistake_ends_in_one_line_that_says_what_to_do(options, pair, recorded, capsys):
-    for folder in ("empty", "simulated"):
-        Path(folder).mkdir()
-    shutil.copy(recorded / "reach.npz", "simulated")
-    shutil.copytree(pair, "mixed")
-    shutil.copy(recorded / "reach.npz", "mixed")
+def test_a_mistake_ends_in_one_line_that_says_what_to_do(options, pair, capsys):
+    Path("empty").mkdir()
     Path("a-file.npz").touch()
+    shutil.copytree(pair, "mixed")
+    for folder in ("simulated", "mixed"):
+        save_recording(folder, own_recording(task="reach") | {"meta": '{"simulator": "bowl"}'})
     before = fingerprint(Path())
     argv = [*SHORT, "--data", pair, "--out", "run", *options.split()]
     assert REFUSED[options] in fails(train, argv, capsys)

@@ -14,6 +14,7 @@ import numpy as np
 
 import common
 import evaluate
+from clip import TextWeightsError
 from data import RecordingError, WindowSampler, load_demonstrations
 from model import CheckpointError
 from simulator import simulator_of
@@ -53,4 +54,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    common.command_line(main, errors=(RecordingError, CheckpointError))
+    common.command_line(main, errors=(RecordingError, CheckpointError, TextWeightsError))
