@@ -133,8 +133,10 @@ def command_of(stage: str, data: Path) -> list[str]:
     return [sys.executable, str(ROOT / script), *argv]
 
 
-def run_once(words: list[str], folder: Path, rng: random.Random) -> tuple[int, str | None]:
-    """Starts a command in a folder, and sends it a signal unless it ends before.
+def run_once(
+    words: list[str], folder: Path, seconds: float, rng: random.Random
+) -> tuple[int, str | None]:
+    """Starts a command in a folder, and sends it a signal unless it ends within some seconds.
 
     A signal goes to the process alone, or to all of its session, as from a closed terminal. Returns
     the exit code, and the name of the signal. No process of the session may be left, and the
@@ -150,7 +152,7 @@ def run_once(words: list[str], folder: Path, rng: random.Random) -> tuple[int, s
     )
     sent = None
     try:
-        _, error = process.communicate(timeout=rng.uniform(2, 20))
+        _, error = process.communicate(timeout=seconds)
     except subprocess.TimeoutExpired:
         number, to_all = rng.choice(SIGNALS), rng.random() < 0.5
         send = os.killpg if to_all else os.kill
@@ -168,10 +170,13 @@ def run_once(words: list[str], folder: Path, rng: random.Random) -> tuple[int, s
     return process.returncode, sent
 
 
-def fuzz_stage(folder: Path, whole: Path, stage: str, data: Path, rng: random.Random) -> list[str]:
+def fuzz_stage(
+    stage: str, folder: Path, *, data: Path, whole: Path, seconds: float, rng: random.Random
+) -> list[str]:
     """Kills one command again and again until it ends by itself; returns what ended it before.
 
-    Its result, and the files beside it, must then be those in the folder `whole`.
+    Its result, and the files beside it, must then be those in the folder `whole`, where the same
+    command was left alone and took so many seconds.
     """
     _, left = STAGES[stage]
     ended, code = [], None
@@ -179,7 +184,7 @@ def fuzz_stage(folder: Path, whole: Path, stage: str, data: Path, rng: random.Ra
         words = command_of(stage, data)
         if stage == "training" and (folder / left).exists():
             words.append("--resume")
-        code, sent = run_once(words, folder, rng)
+        code, sent = run_once(words, folder, rng.uniform(0.1, 1.5) * seconds, rng)
         if sent is not None:
             ended.append(f"{stage} {sent}")
     assert same(result(folder / left), result(whole / left)), f"{stage} has another result"
@@ -192,14 +197,19 @@ def fuzz_commands(folder: Path, data: Path, kills: int, seed: int = 0) -> list[s
     """All stages, one after the other, again and again until `kills` signals were sent."""
     whole = folder / "whole"
     whole.mkdir()
+    seconds = {}
     for stage in STAGES:
+        began = time.monotonic()
         subprocess.run(command_of(stage, data), cwd=whole, check=True, capture_output=True)
+        seconds[stage] = time.monotonic() - began
 
     rng, ended = random.Random(seed), []
     while len(ended) < kills:
         killed = Path(tempfile.mkdtemp(dir=folder))
         for stage in STAGES:
-            ended += fuzz_stage(killed, whole, stage, data, rng)
+            ended += fuzz_stage(
+                stage, killed, data=data, whole=whole, seconds=seconds[stage], rng=rng
+            )
             print(f"{len(ended)} signals, {stage} ended as if there had been none", flush=True)
     return ended
 
