@@ -157,8 +157,8 @@ BALLS = """
   <body name="ball" pos="0.4 0.3 0.5"><geom name="ball" size="0.3" rgba="1 0 0 1"/></body>
   <body><geom name="cube" type="box" size="0.2 0.2 0.2" pos="-0.5 -0.3 0.2"/></body>
   <body><geom name="under the floor" type="sphere" size="0.1" pos="0.4 -0.4 -0.3"/></body>
-  <site name="marker" type="sphere" size="0.1" pos="-0.4 0.4 0.6" rgba="0 1 0 1"/>
   <site type="sphere" size="0.3" pos="0 0 1" rgba="1 0 0 0"/>
+  <site name="marker" type="sphere" size="0.1" pos="-0.4 0.4 0.6" rgba="0 1 0 1"/>
   <site type="sphere" size="0.3" pos="0 0 1" group="3"/>
 """
 BALL, CUBE, MARKER = (0.4, 0.3, 0.5), (-0.5, -0.3, 0.2), (-0.4, 0.4, 0.6)
@@ -212,16 +212,22 @@ def test_points_lie_on_what_is_seen_and_the_floor_only_hides():
     assert len(with_floor) == 60 * 60 and (np.abs(with_floor[:, 2]) < 1e-5).sum() > 1000
 
 
-def test_only_points_in_the_box_are_returned_and_all_of_them():
+@pytest.mark.parametrize(
+    "box",
+    [
+        ((-0.45, -0.45, 0.05), (0.45, 0.3, 0.55)),  # cuts the ball, the cube and the marker
+        ((-1, -1, 0.399), (1, 1, 0.401)),  # the top of the cube, and a slice of the ball
+        ((-1, -1, -1), (0.3, 0.3, 3)),  # the camera is inside
+        ((-1, -1, 3), (1, 1, 4)),  # behind the camera
+    ],
+)
+def test_only_points_in_the_box_are_returned_and_all_of_them(box):
     model, data = scene(BALLS)
     points = RayCastCamera(model, "down").points(data)
-    low, high = (-0.45, -0.45, 0.05), (0.45, 0.3, 0.55)  # cuts the ball, the cube and the marker
-    inside = ((points >= low) & (points <= high)).all(axis=1)
-    cut = RayCastCamera(model, "down", box=(low, high)).points(data)
+    inside = ((points >= box[0]) & (points <= box[1])).all(axis=1)
+    cut = RayCastCamera(model, "down", box=box).points(data)
     np.testing.assert_array_equal(cut, points[inside])
-    assert 0 < len(cut) < len(points)
-    elsewhere = RayCastCamera(model, "down", box=((-1, -1, 3), (1, 1, 4))).points(data)
-    assert elsewhere.shape == (0, 3)
+    assert len(cut) > 50 or (box[0][2] == 3 and cut.shape == (0, 3))
 
 
 def test_colors_and_ids_are_those_of_geoms_and_sites():
@@ -277,13 +283,29 @@ def test_a_geoms_own_color_goes_before_its_materials_as_in_mujocos_renderer():
     ],
 )
 def test_a_site_looks_like_a_geom_of_its_shape_unless_sites_are_not_to_be_seen(shape):
-    body = '<body pos="0.1 0 0" euler="10 20 30">{}</body><camera name="down" pos="0 0 3"/>'
+    body = '<body pos="5.1 0 0" euler="10 20 30">{}</body><camera name="down" pos="5 0 3"/>'
     model, data = scene(body.format(f"<site {shape}/>"))
     geom_model, geom_data = scene(body.format(f"<geom {shape}/>"))
     depth = RayCastCamera(model, "down").depth(data)
     np.testing.assert_array_equal(depth, RayCastCamera(geom_model, "down").depth(geom_data))
     assert np.isfinite(depth).sum() > 50
     assert np.isinf(RayCastCamera(model, "down", sites=False).depth(data)).all()
+
+
+def test_only_meshes_become_ellipsoids():
+    world = """
+      <camera name="down" pos="0 0 3"/>
+      <body name="link" pos="-0.5 0 0">
+        <geom type="mesh" mesh="tetrahedron"/>
+        <geom type="box" size="0.2 0.2 0.2" pos="1 0 0"/>
+      </body>
+      <body><geom type="mesh" mesh="tetrahedron" pos="0 0.5 0"/></body>"""
+    model, data = scene(world, TETRAHEDRON)
+    exact = RayCastCamera(model, "down").points(data, segmentation=True)
+    rough = RayCastCamera(model, "down", ellipsoids=("link",)).points(data, segmentation=True)
+    for geom, same in enumerate((False, True, True)):
+        before, after = (points[ids == geom] for points, ids in (exact, rough))
+        assert len(before) > 50 and np.array_equal(before, after) == same
 
 
 def test_groups_can_be_chosen():
