@@ -294,18 +294,18 @@ def test_a_site_looks_like_a_geom_of_its_shape_unless_sites_are_not_to_be_seen(s
 
 def test_only_meshes_become_ellipsoids():
     world = """
-      <camera name="down" pos="0 0 3"/>
-      <body name="link" pos="-0.5 0 0">
+      <camera name="down" pos="0 0 6"/>
+      <body name="link" pos="-2 0 0">
         <geom type="mesh" mesh="tetrahedron"/>
-        <geom type="box" size="0.2 0.2 0.2" pos="1 0 0"/>
+        <geom type="box" size="0.2 0.2 0.2" pos="3 0 0"/>
       </body>
-      <body><geom type="mesh" mesh="tetrahedron" pos="0 0.5 0"/></body>"""
+      <body><geom type="mesh" mesh="tetrahedron" pos="0 1 0"/></body>"""
     model, data = scene(world, TETRAHEDRON)
     exact = RayCastCamera(model, "down").points(data, segmentation=True)
     rough = RayCastCamera(model, "down", ellipsoids=("link",)).points(data, segmentation=True)
     for geom, same in enumerate((False, True, True)):
         before, after = (points[ids == geom] for points, ids in (exact, rough))
-        assert len(before) > 50 and np.array_equal(before, after) == same
+        assert len(before) > 20 and np.array_equal(before, after) == same
 
 
 def test_groups_can_be_chosen():
@@ -455,7 +455,7 @@ plt.savefig("ant.png")
 def test_the_file_alone_in_an_empty_folder_draws_a_cloud_of_gymnasiums_ant(tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
     readme = (ROOT / "README.md").read_text()
-    assert "RayCastCamera(" not in readme or ANT in readme
+    assert ANT in readme
     (tmp_path / "camera.py").write_text((ROOT / "camera.py").read_text())
     lines = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\n{ANT}print(len(points))"
     command = [sys.executable, "-I", "-c", lines]
