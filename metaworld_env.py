@@ -90,19 +90,18 @@ INSTRUCTIONS = {
 
 CAMERA = "corner2"
 CAMERA_POSITION = (0.6, 0.295, 0.8)  # world frame, metres; the orientation stays Meta-World's
-CAMERA_PIXELS = 84  # height and width
+CAMERA_PIXELS = 96  # height and width
 ARM_LINKS = tuple(f"right_l{i}" for i in range(7))  # bodies, without the hand and its fingers
 RENDER_PIXELS = 240
 WORKSPACE = ((-0.55, 0.3, -0.05), (0.6, 1.0, 0.48))  # the table and its holes, below the upper arm
 NUM_POINTS = 512
-NUM_OBJECT_POINTS = 384  # at most so many of a cloud are not of the arm
 EPISODE_STEPS = 200
 
 # How recordings are made. One that was made in another way is refused by `simulator.collect`.
 RECIPE = {
     "simulator": "meta-world",
     "camera": [CAMERA, list(CAMERA_POSITION), CAMERA_PIXELS],
-    "arm": ["after at most", NUM_OBJECT_POINTS],
+    "arm": "seen where nothing else is",
     "workspace": [list(corner) for corner in WORKSPACE],
     "num_points": NUM_POINTS,
     "sampling": "farthest points",
@@ -114,8 +113,8 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
     """A Meta-World task as a point cloud; also `gymnasium.make("DAMI/MetaWorld-v0", task="reach")`.
 
     Observation: "point_cloud" (N, 3) float32 and "agent_pos" (9,) float32, the positions of the end
-    effector, the right and the left finger; world frame, metres. A cloud begins with at most 384
-    farthest points of objects, goal marker and gripper, and is filled up with those of the arm.
+    effector, the right and the left finger; world frame, metres. A cloud is of farthest points of
+    objects, goal marker and gripper; the arm only hides, unless nothing else is seen.
 
     Action (4,) in [-1, 1]: dx, dy, dz in centimetres, gripper (1 closes).
 
@@ -229,23 +228,16 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         return {"point_cloud": self.cloud(), "agent_pos": positions.astype(np.float32)}
 
     def cloud(self) -> np.ndarray:
-        """Returns N of the points that the camera sees, (N, 3) float32, the arm's last.
+        """Returns farthest points of what the camera sees of all but the arm, (N, 3) float32.
 
-        Where it sees fewer, they are repeated from the first one. Raises ValueError where it sees
-        none.
+        Where it sees fewer than N points, they are repeated from the first one. Where the arm hides
+        everything else, the points are the arm's. Raises ValueError where nothing is seen.
         """
-        N = self.num_points
         points, geoms = self.camera.points(self.sawyer_env.data, segmentation=True)
         of_arm = np.isin(geoms, self.arm_geoms)  # (M,) bool
-        cloud, arm = points[~of_arm], points[of_arm]
-        if len(cloud) > 0:
-            cloud = farthest_point_sample(cloud, min(N, NUM_OBJECT_POINTS, len(cloud)))
-        if len(cloud) < N and len(arm) > 0:
-            arm = farthest_point_sample(arm, min(N - len(cloud), len(arm)))
-            cloud = np.concatenate([cloud, arm])
-        if len(cloud) == 0:
-            raise ValueError(f"{self.task}: the camera sees no point inside the workspace")
-        return np.resize(cloud, (N, 3))
+        if not of_arm.all():
+            points = points[~of_arm]
+        return farthest_point_sample(points, self.num_points)
 
     def expert_action(self) -> np.ndarray:
         """Returns the scripted expert's action (4,) float32 in [-1, 1] for the present moment."""

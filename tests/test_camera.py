@@ -494,7 +494,7 @@ def test_ellipsoids_stand_in_for_the_arms_meshes_in_clouds_alone():
         points = camera.points(data)
         points_expected = (origin + rough[:, None] * rays)[np.isfinite(rough)]
         np.testing.assert_allclose(points, points_expected, atol=1e-6)
-        depth = (exact * -camera.rays[:, 2]).reshape(84, 84)
+        depth = (exact * -camera.rays[:, 2]).reshape(camera.height, camera.width)
         np.testing.assert_array_equal(camera.depth(data), depth)
     assert 0.8 < common / either < 0.95 and 0.001 < np.median(apart) < 0.02
 
@@ -512,10 +512,11 @@ images = []
 for task in ("reach", "shelf-place", "window-open"):
     env = metaworld_env.MetaWorldPointCloudEnv(task)
     env.begin(0)
-    renderer = mujoco.Renderer(env.sawyer_env.model, 84, 84)
+    camera = env.camera
+    renderer = mujoco.Renderer(env.sawyer_env.model, camera.height, camera.width)
     renderer.enable_depth_rendering()
     renderer.update_scene(env.sawyer_env.data, metaworld_env.CAMERA)
-    images.append((renderer.render(), env.camera.depth(env.sawyer_env.data)))
+    images.append((renderer.render(), camera.depth(env.sawyer_env.data)))
 np.save(sys.argv[1], images)
 """
 
