@@ -36,7 +36,7 @@ FEW = (
 
 
 def pytest_collection_finish(session):
-    """The tutorial, cut short, takes half a minute of a core: it runs beside the tests before its own."""
+    """The tutorial, cut short, takes half a minute: it runs beside the tests before its own."""
     if any(item.name == "test_the_tutorial_runs" for item in session.items):
         command = [sys.executable, str(Path(__file__).with_name("test_notebook.py"))]
         options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
