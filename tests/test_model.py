@@ -993,7 +993,10 @@ def test_a_policy_that_reads_a_task_does_not_act_without_one():
     [
         ({"kernel_size": 4}, "kernel_size is 4: use an odd one"),
         ({"horizon": 15}, "horizon 15 is no multiple of 2: it is halved between the 2 levels"),
-        ({"horizon": 4}, "n_action_steps 8: horizon 4 has 3 after observation 2"),
+        (
+            {"horizon": 4},
+            "n_action_steps is 8: of horizon 4 there are 3 actions after n_obs_steps 2",
+        ),
     ],
 )
 def test_a_policy_that_cannot_be_is_refused_where_it_is_made(changes, message):

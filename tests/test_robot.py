@@ -1246,7 +1246,7 @@ def robot_policy(path, **changes):
     meta |= {"gripper_open_at": 1000, **robot.boxes(Settings(**BOXES))}
     meta["rotation_near_rad"] = list(Settings(**BOXES).rotation_near_rad)
     recorded = data.Demonstrations("stack-cube", "Stack the cube.", *arrays, meta)
-    policy.normalizer.fit(*(torch.from_numpy(x) for x in (points.astype(np.float32), *arrays[1:3])))
+    policy.normalizer.fit([data.WindowSampler(recorded, policy.config)])
     data.save_demonstrations(Path(path).with_name("demos.npz"), recorded)
     info = {"suite": "own", "preset": "tiny", "arguments": {}, "step": 0}
     model.save(path, policy, text_weights="random-seed-0", **info)
