@@ -18,6 +18,7 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -1246,7 +1247,15 @@ def robot_policy(path, **changes):
     meta |= {"gripper_open_at": 1000, **robot.boxes(Settings(**BOXES))}
     meta["rotation_near_rad"] = list(Settings(**BOXES).rotation_near_rad)
     recorded = data.Demonstrations("stack-cube", "Stack the cube.", *arrays, meta)
-    policy.normalizer.fit([data.WindowSampler(recorded, policy.config)])
+    policy.normalizer.fit(
+        [
+            SimpleNamespace(
+                points=torch.from_numpy(recorded.points),
+                state=torch.from_numpy(recorded.state),
+                action=torch.from_numpy(recorded.action),
+            )
+        ]
+    )
     data.save_demonstrations(Path(path).with_name("demos.npz"), recorded)
     info = {"suite": "own", "preset": "tiny", "arguments": {}, "step": 0}
     model.save(path, policy, text_weights="random-seed-0", **info)

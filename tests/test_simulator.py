@@ -249,7 +249,7 @@ def test_a_read_only_folder_is_refused_in_one_line(tmp_path, monkeypatch):
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(filelock.FileLock, "acquire", acquire)
-    with pytest.raises(UserError, match=r"written to \(permission denied\): use another --data"):
+    with pytest.raises(UserError, match=r"written to \(Permission denied\): use another --data"):
         collect(ToySimulator(), [TASK], tmp_path, episodes=1)
 
 
