@@ -1401,7 +1401,7 @@ def when_it_runs(emulator, act):
     def wait():
         while not emulator.received and len(emulator.gripper_frames) < 8:
             time.sleep(0.01)
-        time.sleep(0.2)
+        time.sleep(0.6)  # in which some actions are taken, on a busy machine, too
         act()
 
     threading.Thread(target=wait, daemon=True).start()
