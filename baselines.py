@@ -42,7 +42,6 @@ from model import (
     ConditionalUNet1d,
     Context,
     DP3Policy,
-    LayerNorm,
     PolicyConfig,
     ResidualBlock,
     TransformerBlock,
@@ -230,8 +229,8 @@ class MixerBlock(nn.Module):
 
     def __init__(self, mixer: nn.Module, width: int):
         super().__init__()
-        self.norm1 = LayerNorm(width)
-        self.norm2 = LayerNorm(width)
+        self.norm1 = nn.LayerNorm(width)
+        self.norm2 = nn.LayerNorm(width)
         self.mixer = mixer
         wide = 4 * width
         self.mlp = nn.Sequential(nn.Linear(width, wide), nn.GELU(), nn.Linear(wide, width))
@@ -461,9 +460,9 @@ class FrequencyTransformer(nn.Module):
         self.hidden_token = nn.Parameter(0.02 * torch.randn(W))
         self.encoder = nn.ModuleList(MaskedBlock(W, self.HEADS) for _ in range(self.LAYERS))
         self.decoder = nn.ModuleList(TransformerBlock(W, self.HEADS) for _ in range(self.LAYERS))
-        self.norm_in = LayerNorm(W)
-        self.norm_encoder = LayerNorm(W)
-        self.norm_decoder = LayerNorm(W)
+        self.norm_in = nn.LayerNorm(W)
+        self.norm_encoder = nn.LayerNorm(W)
+        self.norm_decoder = nn.LayerNorm(W)
         self.project_decoder = nn.Linear(W, W)
         self.head = DiffusionHead(config)
 

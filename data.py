@@ -434,6 +434,16 @@ def workspace_center(points: np.ndarray, workspace: Any) -> Tensor:
 # ---- Windows -------------------------------------------------------------------------------------
 
 
+def choose_indices(candidates: Tensor, n: int, generator: torch.Generator) -> Tensor:
+    """Draws n of the candidates (W,) in a random order; with repetition only where W < n."""
+    W, device = len(candidates), generator.device
+    if n <= W:
+        chosen = torch.randperm(W, generator=generator, device=device)[:n]
+    else:
+        chosen = torch.randint(W, (n,), generator=generator, device=device)
+    return candidates[chosen.cpu()]
+
+
 class WindowSampler:
     """Windows of H actions that begin with To observations, from one task's demonstrations.
 
@@ -447,8 +457,10 @@ class WindowSampler:
         demonstrations: of one task.
         config: a `model.PolicyConfig`, or anything with its dimensions.
         device: where the tensors are held.
-        after_success: no window begins more than so many frames after its episode's first success,
-            if the recording says when that was. None: no limit.
+        after_success: a window that begins more than so many frames after its episode's first
+            success, if the recording says when that was, is a late one. None: no window is.
+        late_fraction: the share of late windows among those that are drawn. They show how to stay
+            where the task is done, and are nearly the same. 0: there are none.
         augment: `batch` moves each scene by an affine map of its own, where the recording says
             which numbers of a state are positions. Other directions or rotations in the state or
             the action stay as they are.
@@ -463,6 +475,7 @@ class WindowSampler:
         *,
         device: str | torch.device = "cpu",
         after_success: int | None = None,
+        late_fraction: float = 0.0,
         augment: bool = False,
     ) -> None:
         self.task = demonstrations.task
@@ -486,15 +499,22 @@ class WindowSampler:
         self.max_displacement = max(1.0, largest)  # moved actions are clipped to [-1, 1] or more
 
         success_frames = demonstrations.meta.get("success_frames")
-        windows = []  # of each episode
+        windows, late = [], []  # of each episode
         for index, episode in enumerate(self.episodes):
-            last_start = None
+            of_episode = self.windows_of(episode)  # (windows, H)
+            is_late = torch.zeros(len(of_episode), dtype=torch.bool)
             if after_success is not None and success_frames is not None:
-                last_start = episode.start + success_frames[index] + after_success
-            windows.append(self.windows_of(episode, last_start))
+                last_early_start = episode.start + success_frames[index] + after_success
+                is_late = of_episode[:, 0] > last_early_start
+            if late_fraction == 0:
+                of_episode, is_late = of_episode[~is_late], is_late[~is_late]
+            windows.append(of_episode)
+            late.append(is_late)
         counts = torch.tensor([len(frames) for frames in windows])
         self.windows = torch.cat(windows).to(device)  # (W, H) the frame of each action
         self.episode_of = torch.arange(len(windows)).repeat_interleave(counts)  # (W,)
+        self.late = torch.cat(late)  # (W,) bool
+        self.late_fraction = late_fraction
 
     def check_dimensions(self, demonstrations: Demonstrations) -> None:
         """Raises RecordingError where the policy has other dimensions, or wants more points."""
@@ -528,17 +548,12 @@ class WindowSampler:
                 f"{self.config.demo_positions} positions: cut it, or train on such data"
             )
 
-    def windows_of(self, episode: slice, last_start: int | None) -> Tensor:
-        """Returns the frames of each window of an episode, (windows, H).
-
-        Where it is given, no window begins after the frame `last_start`.
-        """
+    def windows_of(self, episode: slice) -> Tensor:
+        """Returns the frames of each window of an episode, (windows, H)."""
         config = self.config
         first = episode.start - (config.n_obs_steps - 1)
         last = episode.stop - config.horizon + (config.n_action_steps - 1)
         last = max(last, first)  # a short episode keeps one
-        if last_start is not None:
-            last = min(last, last_start)
         frames = torch.arange(first, last + 1)[:, None] + torch.arange(config.horizon)
         return frames.clamp(episode.start, episode.stop - 1)
 
@@ -548,20 +563,26 @@ class WindowSampler:
     def sample(
         self, n: int, generator: torch.Generator, exclude: int | None = None
     ) -> dict[str, Tensor]:
-        """Draws n different windows (with repetition only where there are fewer than n).
+        """Draws n different windows (with repetition only where there are too few).
 
-        None is of the episode `exclude`, unless that is the only one.
+        None is of the episode `exclude`, unless that is the only one. If there are no late windows,
+        early ones take their place.
         """
-        candidates = torch.arange(len(self))
+        allowed = torch.ones(len(self), dtype=torch.bool)
         if exclude is not None and len(self.episodes) > 1:
-            candidates = candidates[self.episode_of != exclude]
+            allowed = self.episode_of != exclude
+        early = torch.nonzero(allowed & ~self.late).flatten()
+        late = torch.nonzero(allowed & self.late).flatten()
+        if len(late) == 0:
+            return self.gather(choose_indices(early, n, generator))
 
-        W, device = len(candidates), generator.device
-        if n <= W:
-            chosen = torch.randperm(W, generator=generator, device=device)[:n]
-        else:
-            chosen = torch.randint(W, (n,), generator=generator, device=device)
-        return self.gather(candidates[chosen.cpu()])
+        chances = torch.rand(n, generator=generator, device=generator.device)
+        n_late = int((chances < self.late_fraction).sum())
+        chosen = torch.cat(
+            [choose_indices(early, n - n_late, generator), choose_indices(late, n_late, generator)]
+        )
+        # In a random order, since a batch is split into support and query
+        return self.gather(choose_indices(chosen, n, generator))
 
     def gather(self, indices: Tensor) -> dict[str, Tensor]:
         """Returns the windows of these indices (n,)."""

@@ -5,9 +5,10 @@
     python evaluate.py --task reach --gif reach.gif          # watch one rollout (.mp4 too)
     python evaluate.py --without instruction --swap demonstration    # is the demonstration read?
 
-An episode succeeds if any of its steps reports success, so a rollout ends there. Each rollout
-holds one reference demonstration, drawn from the task's own. Goals come from seeds that no
-demonstration uses. Nothing is adapted here; finetune.py adapts to novel tasks.
+An episode is played to its end, and its success is reported twice: at any step, as the paper and
+DP3 count it, and at the end, as Meta-World's own evaluation does. Each rollout holds one reference
+demonstration, drawn from the task's own. Goals come from seeds that no demonstration uses. Nothing
+is adapted here; finetune.py adapts to novel tasks.
 
 One action, from the network to the simulated arm: `rollout` keeps the last To observations of each
 episode, `DAMIPolicy.sample_actions` draws a chunk of actions from them, and the environment's
@@ -39,7 +40,15 @@ from clip import TextWeightsError, text_features
 from common import UserError, progress_bar, report_progress, run_jobs
 from data import RecordingError, WindowSampler, load_demonstrations, positions, write_atomically
 from model import CheckpointError, DAMIPolicy
-from report import Parts, Successes, mean_interval, mean_success, paper_columns, write_report
+from report import (
+    Outcomes,
+    Parts,
+    Successes,
+    mean_interval,
+    mean_success,
+    paper_columns,
+    write_report,
+)
 from simulator import Environment, Simulator, check_task, collect, evaluation_seed, simulator_of
 
 EVALUATION_SEED = 0  # of the goals; the same for every seed of training
@@ -56,8 +65,9 @@ def rollout(
     text: Tensor,
     generator: torch.Generator,
     zero_demonstration: bool = False,
-) -> list[bool]:
-    """Rolls out E episodes of one task side by side, and says which of them succeeded.
+    stop_at_success: bool = False,
+) -> list[list[bool]]:
+    """Rolls out E episodes of one task side by side, and says which of their steps were a success.
 
     The demonstrations are encoded once. The policy reads To frames in every Ta: the others are not
     observed, since observing takes most of a simulator's time.
@@ -69,9 +79,10 @@ def rollout(
         text: instruction feature, (text_dim,).
         generator: draws demonstrations and noise; on the CPU.
         zero_demonstration: the policy reads zeros in place of its demonstration.
+        stop_at_success: an episode ends at its first success, and not when it is over.
 
     Returns:
-        E booleans.
+        For each of E episodes, whether each step that was taken reported success.
     """
     To = policy.config.n_obs_steps
     device = text.device
@@ -94,7 +105,7 @@ def rollout(
         environment.begin(seed)
         observations.append([environment.observe()] * To)
 
-    success = [False] * len(environments)
+    successes: list[list[bool]] = [[] for _ in environments]
     running = list(range(len(environments)))
     while running:
         points = np.stack([[o["point_cloud"] for o in observations[e]] for e in running])
@@ -108,11 +119,12 @@ def rollout(
         )  # (E, Ta, A)
 
         for e, chunk in zip(list(running), chunks):
-            seen, success[e], ended = take_actions(environments[e], chunk, To)
+            seen, of_steps, ended = take_actions(environments[e], chunk, To, stop_at_success)
             observations[e] = [*observations[e], *seen][-To:]
+            successes[e] += of_steps
             if ended:
                 running.remove(e)
-    return success
+    return successes
 
 
 def sample_chunks(
@@ -139,22 +151,22 @@ def sample_chunks(
 
 
 def take_actions(
-    environment: Environment, chunk: np.ndarray, n_observations: int
-) -> tuple[list[dict[str, np.ndarray]], bool, bool]:
+    environment: Environment, chunk: np.ndarray, n_observations: int, stop_at_success: bool
+) -> tuple[list[dict[str, np.ndarray]], list[bool], bool]:
     """Takes the actions of a chunk (Ta, A), up to the end of the episode.
 
     Returns the observations after the last `n_observations` actions (fewer if the chunk is shorter,
-    or the episode ends before), whether the episode succeeded, and whether it ended. A success
-    ends it: no later step could undo that.
+    or the episode ends before), whether each step reported success, and whether the episode ended.
     """
-    seen = []
+    seen, successes = [], []
     for i, action in enumerate(chunk):
         _, truncated, info = environment.advance(action)
-        if info["success"] or truncated:
-            return seen, info["success"], True
+        successes.append(info["success"])
+        if truncated or (stop_at_success and info["success"]):
+            return seen, successes, True
         if i >= len(chunk) - n_observations:
             seen.append(environment.observe())
-    return seen, False, False
+    return seen, successes, False
 
 
 # ---- Checkpoints, and what they say --------------------------------------------------------------
@@ -260,8 +272,9 @@ def evaluate_checkpoint(
     n_demonstrations: int | None = None,
     zero_demonstration: bool = False,
     known_goals: bool = False,
+    stop_at_success: bool = False,
     config_overrides: dict[str, Any] | None = None,
-) -> Successes:
+) -> Outcomes:
     """Rolls a checkpoint out on tasks of a simulator, in parallel processes.
 
     Args:
@@ -276,10 +289,11 @@ def evaluate_checkpoint(
         n_demonstrations: use only the first so many of each recording; None: all.
         zero_demonstration: the policy reads zeros in place of its demonstration.
         known_goals: roll out on the demonstrations' goals, at most `episodes` of them, each once.
+        stop_at_success: an episode ends at its first success; it is quicker.
         config_overrides: of the policy's configuration, see `inference_overrides`.
 
     Returns:
-        Task -> E booleans, in the order of the episodes. They do not depend on `workers`.
+        The successes, in the order of the episodes. They do not depend on `workers`.
     """
     jobs = []
     for task, recording in recordings.items():
@@ -297,9 +311,10 @@ def evaluate_checkpoint(
                     "text": text[task].cpu().numpy(),  # tensors would be shared, not copied
                     "seeds": seeds[start : start + EPISODES_A_JOB],
                     "zero_demonstration": zero_demonstration,
+                    "stop_at_success": stop_at_success,
                 }
             )
-    job_successes = run_jobs(
+    job_episodes = run_jobs(
         rollout_job,
         jobs,
         workers=workers,
@@ -308,10 +323,13 @@ def evaluate_checkpoint(
         setup=partial(prepare_worker, checkpoint, simulator, str(device), config_overrides or {}),
     )
 
-    successes: Successes = {task: [] for task in recordings}
-    for job, episode_successes in zip(jobs, job_successes):
-        successes[job["task"]] += episode_successes
-    return successes
+    any_step: Successes = {task: [] for task in recordings}
+    at_end: Successes = {task: [] for task in recordings}
+    for job, episodes_of_job in zip(jobs, job_episodes):
+        for steps in episodes_of_job:
+            any_step[job["task"]].append(any(steps))
+            at_end[job["task"]].append(steps[-1])
+    return Outcomes(any_step, None if stop_at_success else at_end)
 
 
 def prepare_worker(
@@ -329,8 +347,9 @@ def rollout_job(
     text: np.ndarray,
     seeds: list[int],
     zero_demonstration: bool,
-) -> list[bool]:
-    """Rolls out the episodes of these seeds, of one task, in a worker process."""
+    stop_at_success: bool,
+) -> list[list[bool]]:
+    """`rollout` of the episodes of these seeds, of one task, in a worker process."""
     policy = worker_state["policy"]
     device = policy.normalizer.action_scale.device
     if worker_state["task"] != task:
@@ -342,7 +361,7 @@ def rollout_job(
             worker_state["simulator"].make(task, policy.config.num_points)
         )
 
-    success = rollout(
+    successes = rollout(
         policy,
         environments=worker_state["environments"][: len(seeds)],
         seeds=seeds,
@@ -350,9 +369,10 @@ def rollout_job(
         text=torch.from_numpy(text).to(device),
         generator=torch.Generator().manual_seed(seeds[0]),
         zero_demonstration=zero_demonstration,
+        stop_at_success=stop_at_success,
     )
     report_progress(task, len(seeds))
-    return success
+    return successes
 
 
 # ---- Without a simulator: held-out episodes ------------------------------------------------------
@@ -429,6 +449,7 @@ class Frame:
     """A moment of a rollout, as an animation shows it."""
 
     step: int
+    success: bool  # whether the step before it reported success
     picture: np.ndarray  # (240, 240, 3) uint8
     cloud: np.ndarray  # (N, 3), metres
 
@@ -440,6 +461,7 @@ class FilmedEnvironment:
         self.environment = environment
         self.on_step = on_step
         self.steps = 0
+        self.success = False
         self.frames: list[Frame] = []
 
     def begin(self, seed: int) -> None:
@@ -453,12 +475,14 @@ class FilmedEnvironment:
             self.film()
         self.steps += 1
         self.on_step()
-        return self.environment.advance(action)
+        reward, truncated, info = self.environment.advance(action)
+        self.success = info["success"]
+        return reward, truncated, info
 
     def film(self) -> None:
         """Keeps the present moment."""
         cloud = positions(self.observe()["point_cloud"])
-        self.frames.append(Frame(self.steps, self.environment.render(), cloud))
+        self.frames.append(Frame(self.steps, self.success, self.environment.render(), cloud))
 
 
 def write_animation(
@@ -469,8 +493,8 @@ def write_animation(
     *,
     seed: int,
     path: str | Path,
-) -> bool:
-    """Rolls out one episode and animates it: the picture, and what the policy sees beside it.
+) -> list[bool]:
+    """Rolls out one whole episode and animates it: the picture, and what the policy sees beside it.
 
     Args:
         policy: in evaluation mode.
@@ -481,7 +505,7 @@ def write_animation(
         path: of the animation, .gif or .mp4; see `movie_writer`.
 
     Returns:
-        Whether the episode succeeded.
+        Whether each step reported success.
     """
     writer = movie_writer(path)
     episode_seed = evaluation_seed(seed, 0)
@@ -489,7 +513,7 @@ def write_animation(
         environment = FilmedEnvironment(
             simulator.make(sampler.task, policy.config.num_points), on_step=progress.update
         )
-        [success] = rollout(
+        [successes] = rollout(
             policy,
             environments=[environment],
             seeds=[episode_seed],
@@ -498,13 +522,15 @@ def write_animation(
             generator=torch.Generator().manual_seed(episode_seed),
         )
     environment.film()  # how it ended
-    title = f"{sampler.task}: {'success' if success else 'failure'}"
-    animate(environment.frames, title, writer, path)
-    return success
+    animate(environment.frames, sampler.task, writer, path)
+    return successes
 
 
-def animate(frames: Sequence[Frame], title: str, writer: Any, path: str | Path) -> None:
-    """Writes frames as an animation, with a writer of Matplotlib; the last one stays a while."""
+def animate(frames: Sequence[Frame], task: str, writer: Any, path: str | Path) -> None:
+    """Writes frames as an animation, with a writer of Matplotlib; the last one stays a while.
+
+    The title says which of the frames are a success.
+    """
     from matplotlib.animation import FuncAnimation
     from matplotlib.figure import Figure
 
@@ -518,7 +544,7 @@ def animate(frames: Sequence[Frame], title: str, writer: Any, path: str | Path) 
         left.clear()
         left.imshow(frame.picture)
         left.set_axis_off()
-        left.set_title(title, fontsize=9)
+        left.set_title(f"{task}: success" if frame.success else task, fontsize=9)
 
         right.clear()
         height = frame.cloud[:, 2]
@@ -640,6 +666,11 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--without", nargs="+", choices=inputs, default=[], help="zeros in the place of these")
     add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
     add("--known-goals", action="store_true", help="those of the demonstrations, not new ones")
+    add(
+        "--stop-at-success",
+        action="store_true",
+        help="end an episode at its first success: quicker, and success at the end is not measured",
+    )
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
     add("--gif", metavar="FILE", help="animate one rollout instead, .gif or .mp4")
@@ -787,13 +818,16 @@ def of_next_task(inputs: dict[str, Any]) -> dict[str, Any]:
 
 
 def mean_successes(
-    successes: dict[str, Successes], runs: list[list[Checkpoint]], parts: Parts, top: int
+    outcomes: dict[str, Outcomes], runs: list[list[Checkpoint]], parts: Parts, top: int
 ) -> dict[str, str]:
-    """Means over runs, with their intervals: of the last checkpoint, and of the `top` best ones."""
+    """Means over runs, with their intervals: of the last checkpoint, and of the `top` best ones.
+
+    They are of success at any step.
+    """
     means = {}
     for name, tasks in parts.items():
         rates = [  # of each run the success rate of each checkpoint, in percent
-            [mean_success({task: successes[c.label][task] for task in tasks}) for c in run]
+            [mean_success({task: outcomes[c.label].any_step[task] for task in tasks}) for c in run]
             for run in runs
         ]
         means[f"{name}, last checkpoint"] = mean_interval([of_run[-1] for of_run in rates])
@@ -844,8 +878,16 @@ def watch(
     recordings, text, _ = load_inputs(args, simulator, [task], info, device)
     demonstrations = load_demonstrations(recordings[task]).take(args.demonstrations)
     sampler = WindowSampler(demonstrations, policy.config, device=device)
-    success = write_animation(policy, simulator, sampler, text[task], seed=args.seed, path=args.gif)
-    print(f"{task}: {'success' if success else 'failure'}; wrote {args.gif}")
+    successes = write_animation(
+        policy, simulator, sampler, text[task], seed=args.seed, path=args.gif
+    )
+    if successes[-1]:
+        outcome = "success at the end"
+    elif any(successes):
+        outcome = "success, but not at the end"
+    else:
+        outcome = "failure"
+    print(f"{task}: {outcome}; wrote {args.gif}")
 
 
 def measure(
@@ -865,9 +907,9 @@ def measure(
     for file in old_results:
         file.unlink()
 
-    successes = {}
+    outcomes = {}
     for measurement in choose_measurements(runs, recordings, text, args.swap):
-        successes[measurement.label] = evaluate_checkpoint(
+        outcomes[measurement.label] = evaluate_checkpoint(
             checkpoint=measurement.checkpoint,
             simulator=simulator,
             recordings=measurement.recordings,
@@ -879,6 +921,7 @@ def measure(
             n_demonstrations=args.demonstrations,
             zero_demonstration="demonstration" in args.without,
             known_goals=args.known_goals,
+            stop_at_success=args.stop_at_success,
             config_overrides=inference_overrides(args),
         )
 
@@ -893,16 +936,16 @@ def measure(
         "text weights": identity,
         **common.provenance("evaluate.py", argv, device),
         **inference_overrides(args),
-        **mean_successes(successes, runs, parts, args.top),
+        **mean_successes(outcomes, runs, parts, args.top),
     }
     earlier = {checkpoint.label for run in runs for checkpoint in run[:-1]}
     table = write_report(
         out,
-        {label: results for label, results in successes.items() if label not in earlier},
+        {label: outcome for label, outcome in outcomes.items() if label not in earlier},
         provenance,
         parts=parts,
         paper=paper_columns(suite, dict.fromkeys(run[-1].policy for run in runs)),
-        checkpoints=successes if args.top else None,
+        checkpoints=outcomes if args.top else None,
     )
     print(f"\n{table}\n")
     for name, value in provenance.items():

@@ -38,7 +38,7 @@ from data import (
     write_text,
 )
 from model import CheckpointError, DAMIPolicy, ema_model
-from report import Successes
+from report import Outcomes
 from simulator import (
     SIMULATORS,
     Simulator,
@@ -235,8 +235,12 @@ def adapt_checkpoint(
     settings = resolve(settings, info)
     demonstrations = load_demonstrations(recording).take(settings.demonstrations)
     kept, heldout = hold_out(demonstrations, settings.held_out)
-    after_success = info["arguments"]["after_success"]
-    sampler = WindowSampler(kept, policy.config, after_success=after_success)
+    sampler = WindowSampler(
+        kept,
+        policy.config,
+        after_success=info["arguments"]["after_success"],
+        late_fraction=info["arguments"].get("late_fraction", 0.0),
+    )
     write_text(folder / "metrics.jsonl", "")  # lines are appended
     if heldout is not None:
         heldout_sampler = WindowSampler(heldout, policy.config)
@@ -399,7 +403,7 @@ def adapt_tasks(
     config_overrides: dict[str, Any],
     simulator: Simulator | None,
     workers: int | None,
-) -> tuple[dict[str, Successes], float]:
+) -> tuple[dict[str, Outcomes], float]:
     """Adapts a policy to each task separately; rolls it out before, in between and after.
 
     Args:
@@ -410,10 +414,10 @@ def adapt_tasks(
         workers: processes for the rollouts; None: one a core.
 
     Returns:
-        Column ("before", "50 steps" ..., "after") -> task -> success of each episode, no columns
-        without rollouts; and the seconds that adapting took, for all tasks together.
+        Column ("before", "50 steps" ..., "after") -> how the episodes went, no columns without
+        rollouts; and the seconds that adapting took, for all tasks together.
     """
-    results: dict[str, Successes] = {}
+    results: dict[str, Outcomes] = {}
     total_seconds = 0.0
     for task, folder in folders.items():
         seconds = adapt_checkpoint(
@@ -436,7 +440,7 @@ def adapt_tasks(
         columns["after"] = folder / "adapted.pt"
         kept = len(load_demonstrations(paths[task]).take(settings.demonstrations))
         for column, policy in columns.items():
-            successes = evaluate.evaluate_checkpoint(
+            outcomes = evaluate.evaluate_checkpoint(
                 checkpoint=policy,
                 simulator=simulator,
                 recordings={task: paths[task]},
@@ -448,7 +452,9 @@ def adapt_tasks(
                 n_demonstrations=kept - settings.held_out,
                 config_overrides=config_overrides,
             )
-            results.setdefault(column, {}).update(successes)
+            of_column = results.setdefault(column, Outcomes({}, {}))
+            of_column.any_step.update(outcomes.any_step)
+            of_column.at_end.update(outcomes.at_end)
     return results, total_seconds
 
 

@@ -3,10 +3,13 @@
     inner loop    theta'_i = theta - alpha * grad_theta L(theta, support_i)               (Eq. 2)
     outer loop    g = grad_theta 1/|tasks| * sum_i L(theta'_i(theta), query_i)            (Eq. 3)
 
-The outer gradient runs *through* the inner step: theta'_i depends on theta twice, once directly and
-once through the support gradient, so g contains the second derivatives of the support loss.
-`torch.func.grad` gives this by construction, because a gradient is a function like any other and
-can be differentiated again.
+The outer gradient runs *through* the inner step. With v_i the query gradient at theta'_i, and H_i
+the matrix of second derivatives of the support loss at theta, the chain rule says for one step
+
+    g = 1/|tasks| * sum_i (I - alpha * H_i) v_i
+
+H_i is never made: autograd takes v_i back through the support gradient, and that gives H_i v_i at
+about the price of another gradient. First-order MAML leaves H_i out.
 
 Nothing here knows what a policy is. A model enters as `params`, a dictionary of tensors, and a
 function `loss_fn(params, batch) -> scalar tensor`; with a `torch.nn.Module` that is
@@ -18,6 +21,7 @@ function `loss_fn(params, batch) -> scalar tensor`; with a `torch.nn.Module` tha
 """
 
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from inspect import signature
 from itertools import islice
 from typing import Any
@@ -65,7 +69,7 @@ def meta_gradient(
     steps: int = 1,
     first_order: bool = False,
     vectorize: int = 1,
-) -> tuple[Params, Tensor, Tensor]:
+) -> tuple[Params, Tensor]:
     """The gradient of the mean query loss, through each task's inner loop (Eq. 3; Algorithm 1).
 
     Args:
@@ -77,8 +81,7 @@ def meta_gradient(
 
     Returns:
         gradients: name -> tensor.
-        after: the query losses with the adapted parameters, (tasks,).
-        before: the query losses with the given parameters, (tasks,).
+        losses: the query losses with the adapted parameters, (tasks,).
 
     Raises:
         ValueError: there is no task, or `vectorize` is less than 1.
@@ -87,38 +90,58 @@ def meta_gradient(
     """
     if vectorize < 1:
         raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
-    # Parameters that require grad would make autograd record everything a second time.
-    params = {name: p.detach() for name, p in params.items()}
-
-    def query_losses(params: Params, support: Any, query: Any) -> Tensor:
-        adapted = adapt(loss_fn, params, support, lr, steps, first_order)
-        with torch.no_grad():
-            before = loss_fn(params, query)
-        return torch.stack([loss_fn(adapted, query), before])
-
-    def summed_query_loss(params: Params, chunk: list) -> tuple[Tensor, Tensor]:
-        if len(chunk) == 1:
-            losses = query_losses(params, *chunk[0])[None]
-        else:
-            support, query = tree_map(lambda *parts: torch.stack(parts), *chunk)
-            with RightUnderVmap():
-                losses = torch.vmap(query_losses, in_dims=(None, 0, 0))(params, support, query)
-        return losses[:, 0].sum(), losses  # (tasks of the chunk, 2): after, before
+    params = {name: p.detach().requires_grad_() for name, p in params.items()}
 
     tasks = iter(tasks)
     losses = []
-    total = None  # of the gradients of all tasks
+    total = {name: torch.zeros_like(p) for name, p in params.items()}  # of all tasks' gradients
     while chunk := list(islice(tasks, vectorize)):
-        gradients, (_, of_chunk) = grad_and_value(summed_query_loss, has_aux=True)(params, chunk)
-        losses.append(of_chunk.detach())
-        if total is None:
-            total = gradients
-        else:  # not in place: autograd may return one tensor as the gradient of two parameters
-            total = {name: total[name] + g for name, g in gradients.items()}
-    if total is None:
+        gradients, chunk_losses = chunk_gradient(loss_fn, params, chunk, lr, steps, first_order)
+        losses.append(chunk_losses)
+        for name, gradient in gradients.items():
+            total[name] += gradient
+    if not losses:
         raise ValueError("meta_gradient needs at least one task")
-    after, before = torch.cat(losses).unbind(dim=1)
-    return {name: g / len(after) for name, g in total.items()}, after, before
+    losses = torch.cat(losses)
+    return {name: g / len(losses) for name, g in total.items()}, losses
+
+
+def chunk_gradient(
+    loss_fn: LossFn,
+    params: Params,
+    chunk: list[tuple[Any, Any]],
+    lr: float,
+    steps: int,
+    first_order: bool,
+) -> tuple[Params, Tensor]:
+    """The sum over some tasks of their meta-gradients, and their query losses (tasks,).
+
+    `params` require grad. Several tasks run at once, and have adapted parameters each.
+    """
+
+    def adapt_to(support: Any, params: Params) -> Params:
+        return adapt(loss_fn, params, support, lr, steps, first_order)
+
+    def query_gradient(query: Any, adapted: Params) -> tuple[Params, Tensor]:
+        return grad_and_value(loss_fn)(adapted, query)
+
+    if len(chunk) == 1:
+        support, query = chunk[0]
+    else:
+        support, query = tree_map(lambda *parts: torch.stack(parts), *chunk)
+        adapt_to = torch.vmap(adapt_to, in_dims=(0, None))
+        query_gradient = torch.vmap(query_gradient)
+
+    with RightUnderVmap() if len(chunk) > 1 else nullcontext():
+        adapted = adapt_to(support, params)  # theta'_i, with the graph that leads to theta
+        v, losses = query_gradient(query, {name: p.detach() for name, p in adapted.items()})
+        # sum_i (I - alpha H_i) v_i: the query gradients, taken back through the inner loops
+        g = torch.autograd.grad(
+            outputs=list(adapted.values()),
+            inputs=list(params.values()),
+            grad_outputs=[v[name] for name in adapted],
+        )
+    return dict(zip(params, g)), losses.detach().view(-1)
 
 
 # ---- Where PyTorch is wrong under vmap: skip this when reading the method ------------------------

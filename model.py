@@ -194,9 +194,9 @@ class TransformerBlock(nn.Module):
 
     def __init__(self, width: int, heads: int):
         super().__init__()
-        self.norm1 = LayerNorm(width)
+        self.norm1 = nn.LayerNorm(width)
         self.attention = Attention(width, heads)
-        self.norm2 = LayerNorm(width)
+        self.norm2 = nn.LayerNorm(width)
         wide = 4 * width
         self.mlp = nn.Sequential(nn.Linear(width, wide), nn.GELU(), nn.Linear(wide, width))
 
@@ -223,18 +223,22 @@ class PointNetEncoder(nn.Module):
         super().__init__()
         layers = []
         for d_in, d_out in pairwise((point_dim, *widths)):
-            layers += [nn.Linear(d_in, d_out), LayerNorm(d_out), nn.ReLU()]
+            layers += [nn.Linear(d_in, d_out), nn.LayerNorm(d_out), nn.ReLU()]
         self.mlp = nn.Sequential(*layers)
-        self.projection = nn.Sequential(nn.Linear(widths[-1], feature_dim), LayerNorm(feature_dim))
+        self.projection = nn.Sequential(
+            nn.Linear(widths[-1], feature_dim), nn.LayerNorm(feature_dim)
+        )
 
     def forward(self, points: Tensor) -> Tensor:
         """(..., N, P) float, normalized -> (..., feature_dim)."""
         if torch.is_grad_enabled():
-            critical = CriticalPoints.apply(points, *self.mlp.parameters())  # (..., M) indices
-            rows = critical[..., None].expand(*critical.shape, points.shape[-1])  # (..., M, P)
-            points = points.gather(-2, rows)  # (..., M, P)
-        x = self.mlp(points)  # (..., N, widths[-1]), or M for N
-        return self.projection(x.amax(dim=-2))  # (..., feature_dim)
+            rows, place = CriticalPoints.apply(points, *self.mlp.parameters())  # (R,), (clouds, C)
+            critical = points.flatten(0, -2)[rows]  # (R, P), those of all clouds
+            largest = self.mlp(critical).gather(0, place)  # (clouds, widths[-1])
+            largest = largest.view(*points.shape[:-2], -1)  # (..., widths[-1])
+        else:
+            largest = self.mlp(points).amax(dim=-2)  # (..., widths[-1])
+        return self.projection(largest)  # (..., feature_dim)
 
 
 class ObservationEncoder(nn.Module):
@@ -294,9 +298,9 @@ class UnpairedUnifiedTask(nn.Module):
         super().__init__()
         demo, text, width = config.demo_dim, config.text_dim, config.condition_dim
         if config.demo_encoder != "none":
-            self.demo_projection = nn.Sequential(LayerNorm(demo), nn.Linear(demo, width))
+            self.demo_projection = nn.Sequential(nn.LayerNorm(demo), nn.Linear(demo, width))
             self.demo_positions = nn.Parameter(0.02 * torch.randn(config.demo_positions, width))
-        self.text_projection = nn.Sequential(LayerNorm(text), nn.Linear(text, width))
+        self.text_projection = nn.Sequential(nn.LayerNorm(text), nn.Linear(text, width))
         self.text_position = nn.Parameter(0.02 * torch.randn(1, width))
         heads, layers = config.u2t_heads, config.u2t_layers
         self.blocks = nn.ModuleList(TransformerBlock(width, heads) for _ in range(layers))
@@ -1038,18 +1042,7 @@ def one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:200]
 
 
-# ---- Written out for speed, or for PyTorch's bug: skip this when reading the method --------------
-
-
-class LayerNorm(nn.LayerNorm):
-    """Layer normalization, its weight and bias applied outside PyTorch's fused function (2.13).
-
-    Inside it the second derivative is wrong, silently, under `torch.vmap` with another weight for
-    each entry: the vectorized meta-gradient, where every task has adapted weights.
-    """
-
-    def forward(self, x: Tensor) -> Tensor:
-        return F.layer_norm(x, self.normalized_shape, eps=self.eps) * self.weight + self.bias
+# ---- Written out for speed: skip this when reading the method ------------------------------------
 
 
 class GroupNorm(nn.GroupNorm):
@@ -1070,9 +1063,10 @@ class Mish(nn.Module):
 
 
 class Conv1d(nn.Conv1d):
-    """A convolution that keeps the length; a wide one, on a CPU, is written as a matrix product.
+    """A convolution that keeps the length; on a CPU a wide or short one is a matrix product.
 
-    PyTorch's own (2.13) takes up to eight times as long there for the gradient of the weight.
+    PyTorch's own (2.13) takes up to eight times as long for the gradient of a wide one's weight,
+    and half as long again where the sequence is shorter than the kernel.
     """
 
     def __init__(self, d_in: int, d_out: int, kernel_size: int):
@@ -1081,7 +1075,8 @@ class Conv1d(nn.Conv1d):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, d_in, L) -> (B, d_out, L)."""
-        if x.is_cuda or not self.wide:
+        short = x.shape[-1] < self.kernel_size[0]
+        if x.is_cuda or not (self.wide or short):
             return super().forward(x)
         pad = self.padding[0]
         padded = F.pad(x, (pad, pad)).transpose(1, 2)  # (B, L + k - 1, d_in)
@@ -1091,7 +1086,7 @@ class Conv1d(nn.Conv1d):
 
 
 class CriticalPoints(torch.autograd.Function):
-    """Which points of each cloud have the maximum over points in some channel of a PointNet.
+    """Which points have the maximum over their cloud in some channel of a PointNet.
 
     Of 128 points a third do, of 512 a sixth. A pass without gradient finds them, a few clouds at a
     time, which stay in the CPU's cache. Their number depends on the data, which is why `vmap` needs
@@ -1099,45 +1094,68 @@ class CriticalPoints(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(points: Tensor, *layers: Tensor) -> Tensor:
-        """points (..., N, P); weight, bias, norm's weight and bias of each layer -> (..., M)."""
-        return CriticalPoints.indices(CriticalPoints.mark(points, layers), len(layers[-1]))
+    def forward(points: Tensor, *layers: Tensor) -> tuple[Tensor, Tensor]:
+        """points (..., N, P); weight, bias, norm's weight and bias of each layer.
+
+        Returns the critical points of all clouds, (R,) int64 in [0, clouds * N), each once; and for
+        each cloud and channel the place of its maximum among them, (clouds, channels) int64.
+        """
+        largest = CriticalPoints.largest(points, layers)  # (clouds, channels)
+        clouds, N = points.shape[:-2].numel(), points.shape[-2]
+        marked, place = CriticalPoints.mark(largest, clouds * N)
+        return CriticalPoints.rows(marked, min(clouds * N, largest.numel())), place
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        ctx.mark_non_differentiable(output)
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(*output)
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor) -> tuple[Tensor, int]:
-        """`forward` for several tasks, one after the other; (tasks, ..., M) has one M for all."""
-        marked = []
+    def vmap(
+        info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor
+    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+        """`forward` for several tasks, one after the other; all have the largest R of them."""
+        marked, places = [], []
         for task in range(info.batch_size):
-            entries = [x if dim is None else x.select(dim, task) for x, dim in zip(inputs, in_dims)]
-            marked.append(CriticalPoints.mark(entries[0], entries[1:]))
-        return CriticalPoints.indices(torch.stack(marked), inputs[-1].shape[-1]), 0
+            points, *layers = (
+                x if dim is None else x.select(dim, task) for x, dim in zip(inputs, in_dims)
+            )
+            largest = CriticalPoints.largest(points, layers)
+            in_task, place = CriticalPoints.mark(largest, points.shape[:-1].numel())
+            marked.append(in_task)
+            places.append(place)
+        rows = CriticalPoints.rows(torch.stack(marked), min(len(in_task), largest.numel()))
+        return (rows, torch.stack(places)), (0, 0)
 
     @staticmethod
-    def mark(points: Tensor, layers: Sequence[Tensor]) -> Tensor:
-        """points (..., N, P) -> (..., N) int8: 1 for critical points."""
+    def largest(points: Tensor, layers: Sequence[Tensor]) -> Tensor:
+        """points (..., N, P) -> of each cloud and channel the point in [0, clouds * N)."""
         clouds = points.reshape(-1, *points.shape[-2:])  # (clouds, N, P)
-        at_once = len(clouds) if points.is_cuda else max(1, 4096 // points.shape[-2])
+        N = clouds.shape[-2]
+        at_once = len(clouds) if points.is_cuda else max(1, 4096 // N)
         largest = []
         for x in clouds.split(at_once):
             for weight, bias, norm_weight, norm_bias in zip(*(layers[i::4] for i in range(4))):
                 x = F.linear(x, weight, bias)  # (at_once, N, width)
                 x = F.layer_norm(x, bias.shape, norm_weight, norm_bias).relu_()
-            largest.append(x.max(dim=-2).indices)  # (at_once, widths[-1]); faster than argmax
-        marked = torch.zeros(clouds.shape[:-1], dtype=torch.int8, device=points.device)
-        return marked.scatter_(-1, torch.cat(largest), 1).view(points.shape[:-1])
+            largest.append(x.max(dim=-2).indices)  # (at_once, channels); faster than argmax
+        first_points = N * torch.arange(len(clouds), device=points.device)  # of each cloud
+        return torch.cat(largest) + first_points[:, None]  # (clouds, channels)
 
     @staticmethod
-    def indices(marked: Tensor, channels: int) -> Tensor:
-        """(..., N) int8 -> (..., M) int64: critical points first, then others.
+    def mark(largest: Tensor, n: int) -> tuple[Tensor, Tensor]:
+        """The n points of all clouds, 1 for critical ones, (n,) int8; and the places, see above."""
+        marked = torch.zeros(n, dtype=torch.int8, device=largest.device)
+        marked.scatter_(0, largest.flatten(), 1)
+        return marked, (marked.cumsum(0) - 1)[largest]
 
-        M is the largest number of critical points in any cloud (on a GPU a bound of it).
+    @staticmethod
+    def rows(marked: Tensor, bound: int) -> Tensor:
+        """(..., n) int8 -> (..., R) int64: the critical points in their order, then others.
+
+        R is the largest number of critical points (on a GPU a bound of it).
         """
         if marked.is_cuda:
-            most = min(channels, marked.shape[-1])  # a bound: the host does not wait for the GPU
+            most = bound  # the host does not wait for the GPU
         else:
             most = int(marked.sum(dim=-1).max())
         return marked.argsort(dim=-1, descending=True, stable=True)[..., :most]

@@ -4,7 +4,8 @@
 82.2 ± 1.9 (3 runs)   the mean of runs of several seeds, and Student's 95 % interval
 
 Nothing here knows a simulator or a policy: results are lists of successes by task, and whoever
-wants means of some of the tasks names them (`parts`).
+wants means of some of the tasks names them (`parts`). An episode may be a success at one step and
+no longer at the next, so success is counted at any step and at the end.
 
 Letters: T frames, N points.
 """
@@ -12,6 +13,7 @@ Letters: T frames, N points.
 import json
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,14 @@ from data import Demonstrations, positions, write_atomically, write_text
 Successes = dict[str, list[bool]]  # task -> one entry an episode
 Parts = dict[str, list[str]]  # what a mean is called -> the tasks that it is the mean of
 PaperColumns = dict[str, dict[str, float]]  # title -> task -> success rate in percent
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """How the episodes of some tasks went."""
+
+    any_step: Successes  # whether any step of an episode reported success
+    at_end: Successes | None  # whether the last one did; None: not measured
 
 
 # ---- Numbers -------------------------------------------------------------------------------------
@@ -153,32 +163,38 @@ def heldout_table(columns: dict[str, dict[str, float]]) -> str:
 
 def write_report(
     folder: Path,
-    columns: dict[str, Successes],
+    outcomes: dict[str, Outcomes],
     provenance: dict[str, Any],
     *,
     parts: Parts | None = None,
     paper: PaperColumns | None = None,
-    checkpoints: dict[str, Successes] | None = None,
+    checkpoints: dict[str, Outcomes] | None = None,
 ) -> str:
     """Writes success.json, success.md and success.png to a folder, and returns the table.
 
     Args:
         folder: it is made if it does not exist.
-        columns, parts, paper: see `success_table`.
+        outcomes: label -> results; each makes a column of successes at any step, and one of
+            successes at the end if those were measured.
+        parts, paper: see `success_table`.
         provenance: how the results were measured, name -> value; "title" is the chart's.
         checkpoints: label -> results of other checkpoints; they go only into success.json.
     """
+    any_step = {label: outcome.any_step for label, outcome in outcomes.items()}
+    at_end = {label: o.at_end for label, o in outcomes.items() if o.at_end is not None}
+    columns = {**any_step, **{f"{label}, at the end": of_end for label, of_end in at_end.items()}}
     table = success_table(columns, parts, paper)
-    report = {"provenance": provenance, "successes": columns}
+    report = {"provenance": provenance, "successes": any_step, "successes at the end": at_end}
     if checkpoints:
-        report["checkpoints"] = checkpoints
+        report["checkpoints"] = {label: outcome.any_step for label, outcome in checkpoints.items()}
     note = ", ".join(f"{name} {value}" for name, value in provenance.items())
 
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "success.json", json.dumps(report, indent=1))
     write_text(
         folder / "success.md",
-        f"{table}\n\nPercent of episodes, with Wilson's 95 % interval. {note}.\n",
+        f"{table}\n\nPercent of the episodes that were a success at any step, or at the end, with "
+        f"Wilson's 95 % interval. {note}.\n",
     )
     plot_success(columns, folder / "success.png", provenance.get("title", "Success"), paper)
     return table

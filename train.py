@@ -61,7 +61,7 @@ from data import (
 )
 from maml import meta_gradient
 from model import TASK_INPUTS, CheckpointError, DAMIPolicy, PolicyConfig, ema_model, split
-from report import Successes
+from report import Outcomes
 from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
 
 # ---- Settings ------------------------------------------------------------------------------------
@@ -91,8 +91,9 @@ class Settings:
     vectorize: int = setting(1, "tasks that run at once; memory grows with them", least=1)
     bfloat16: bool = setting(False, "compute steps without an inner step in bfloat16")
     after_success: int | None = setting(
-        None, "latest start of a window, in frames after its episode's first success", least=0
+        None, "windows that begin so many frames after their episode's success are late", least=0
     )
+    late_fraction: float = setting(0.0, "fraction of late windows", least=0, most=1)
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
     instruction_dropout: float = setting(
         0.0, "fraction of the batches without instruction", least=0, most=1
@@ -180,6 +181,13 @@ def task_batch(
     return {name: x.to(text.device) for name, x in batch.items()}
 
 
+def multi_task_loss(policy: DAMIPolicy, batches: list[dict[str, Tensor]]) -> Tensor:
+    """The mean loss () of all windows of all tasks, whose batches are as long as each other."""
+    if len({batch["demo_points"].shape for batch in batches}) == 1:  # demonstrations can be stacked
+        batches = [{name: torch.cat([b[name] for b in batches]) for name in batches[0]}]
+    return torch.stack([policy.loss(**batch) for batch in batches]).mean()
+
+
 def multi_task_gradient(
     policy: DAMIPolicy, batches: list[dict[str, Tensor]], bfloat16: bool = False
 ) -> tuple[dict[str, Tensor], Tensor]:
@@ -189,10 +197,8 @@ def multi_task_gradient(
     convolutions are computed in it, and the gradient stays float32. Returns parameter name ->
     gradient, and the loss ().
     """
-    if len({batch["demo_points"].shape for batch in batches}) == 1:  # demonstrations can be stacked
-        batches = [{name: torch.cat([b[name] for b in batches]) for name in batches[0]}]
     with torch.autocast(batches[0]["action"].device.type, torch.bfloat16, enabled=bfloat16):
-        loss = torch.stack([policy.loss(**batch) for batch in batches]).mean()
+        loss = multi_task_loss(policy, batches)
     parameters = dict(policy.named_parameters())
     gradients = torch.autograd.grad(loss, list(parameters.values()))
     return dict(zip(parameters, gradients)), loss.detach()
@@ -200,18 +206,17 @@ def multi_task_gradient(
 
 def maml_gradient(
     policy: DAMIPolicy, batches: list[dict[str, Tensor]], settings: Settings, vectorize: int
-) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+) -> tuple[dict[str, Tensor], Tensor]:
     """The gradient of the query loss through each task's inner step (lines 4 to 19).
 
     `batches` are those of `task_batch`, one for each task, `vectorize` of which run at once.
-    Returns parameter name -> gradient, and the query losses after and before the inner step, both
-    (tasks,).
+    Returns parameter name -> gradient, and the mean query loss after the inner step, ().
     """
 
     def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         return functional_call(policy, params, (), batch)
 
-    return meta_gradient(
+    gradients, losses = meta_gradient(
         loss_fn,
         dict(policy.named_parameters()),
         [split(batch, settings.support) for batch in batches],
@@ -219,6 +224,7 @@ def maml_gradient(
         first_order=settings.maml == "first",
         vectorize=vectorize,
     )
+    return gradients, losses.mean()
 
 
 def learning_rate(step: int, settings: Settings) -> float:
@@ -256,6 +262,9 @@ def start_training(
     return TrainingState(policy, ema_model(policy), optimizer)
 
 
+LOSS_BEFORE_EVERY = 10  # steps; it serves the log alone
+
+
 def meta_train(
     state: TrainingState,
     samplers: dict[str, WindowSampler],
@@ -274,7 +283,8 @@ def meta_train(
 
     Yields:
         Figures of each outer step: loss, gradient_norm and lr. Where there is an inner step, loss
-        is the query loss after it, and loss_before is the query loss before it.
+        is the query loss after it; every tenth such step has the query loss before it as well,
+        loss_before.
 
     Raises:
         UserError: the loss or its gradient is not finite. The step changed nothing then.
@@ -309,8 +319,12 @@ def meta_train(
 
         # The gradient of the mean loss over my tasks
         if inner:
-            gradients, after, before = through_inner_step(batches)  # lines 4 to 19
-            figures = {"loss": after.mean(), "loss_before": before.mean()}
+            gradients, loss = through_inner_step(batches)  # lines 4 to 19
+            figures = {"loss": loss}
+            if step % LOSS_BEFORE_EVERY == 0:
+                queries = [split(batch, settings.support)[1] for batch in batches]
+                with torch.no_grad():
+                    figures["loss_before"] = multi_task_loss(policy, queries)
         else:
             gradients, loss = without_inner_step(batches)
             figures = {"loss": loss}
@@ -465,8 +479,8 @@ class Evaluation:
     workers: int | None
     device: torch.device
 
-    def run(self, step: int, stop: StopRequest) -> Successes | None:
-        """Rolls out the checkpoint of a step and logs the successes, or reads them from the log.
+    def run(self, step: int, stop: StopRequest) -> Outcomes | None:
+        """Rolls out the checkpoint of a step and logs the outcomes, or reads them from the log.
 
         Returns None if no evaluation is due. Ctrl-C stops it at once, since the run is saved.
         """
@@ -475,11 +489,11 @@ class Evaluation:
         if self.simulator is None or settings.episodes == 0 or not due:
             return None
         for line in read_json_lines(self.folder / "metrics.jsonl"):
-            if line["step"] == step and "successes" in line:
-                return line["successes"]
+            if line["step"] == step and "successes_at_end" in line:
+                return Outcomes(line["successes"], line["successes_at_end"])
         try:
             with stop.suspended():
-                successes = evaluate.evaluate_checkpoint(
+                outcomes = evaluate.evaluate_checkpoint(
                     checkpoint=self.folder / f"ema-{step:05d}.pt",
                     simulator=self.simulator,
                     recordings=self.recordings,
@@ -495,10 +509,12 @@ class Evaluation:
         append_json(
             self.folder / "metrics.jsonl",
             step=step,
-            success=report.mean_success(successes),
-            successes=successes,
+            success=report.mean_success(outcomes.any_step),
+            success_at_end=report.mean_success(outcomes.at_end),
+            successes=outcomes.any_step,
+            successes_at_end=outcomes.at_end,
         )
-        return successes
+        return outcomes
 
 
 def log_heldout_errors(
@@ -536,14 +552,14 @@ def report_training(
     policy: str,
     seconds: float,
     provenance: dict[str, Any],
-    successes: Successes | None,
+    outcomes: Outcomes | None,
 ) -> None:
     """Writes and prints the results of a finished run, and prints what can be done with it."""
-    if successes is not None:
+    if outcomes is not None:
         report.plot_curves(folder)
         table = report.write_report(
             folder,
-            {"last checkpoint": successes},
+            {"last checkpoint": outcomes},
             {
                 "title": f"{settings.suite}, base tasks, {settings.preset}, {policy}",
                 "seed": evaluate.EVALUATION_SEED,
@@ -728,7 +744,11 @@ def make_samplers(
     for task, recording in recordings.items():
         kept, heldout = hold_out(recording, settings.held_out)
         train_samplers[task] = WindowSampler(
-            kept, config, after_success=settings.after_success, augment=settings.augment
+            kept,
+            config,
+            after_success=settings.after_success,
+            late_fraction=settings.late_fraction,
+            augment=settings.augment,
         )
         if heldout is not None:
             heldout_samplers[task] = WindowSampler(heldout, config)
@@ -811,13 +831,13 @@ def run(
     bar = common.progress_bar(
         desc="training", unit="step", total=settings.steps, initial=state.step, disable=rank != 0
     )
-    successes = None
+    outcomes = None
     with StopRequest() as stop, bar:
         if rank == 0 and state.step > 0:
             last_checkpoint = folder / f"ema-{state.step:05d}.pt"
             if is_milestone(state.step, settings) and not last_checkpoint.exists():
                 save_average(folder, state, checkpoint_info)  # of flags that changed on --resume
-            successes = evaluation.run(state.step, stop)  # the run may have been stopped during it
+            outcomes = evaluation.run(state.step, stop)  # the run may have been stopped during it
         began = time.monotonic()
         for figures in meta_train(state, train_samplers, text, settings, rank=rank, world=world):
             state.seconds += time.monotonic() - began
@@ -841,10 +861,10 @@ def run(
             if stop.requested:
                 raise KeyboardInterrupt(f"saved after step {state.step}, add --resume to go on")
             if rank == 0:
-                successes = evaluation.run(state.step, stop)
+                outcomes = evaluation.run(state.step, stop)
             began = time.monotonic()
     if rank == 0:
-        report_training(folder, settings, config.policy, state.seconds, provenance, successes)
+        report_training(folder, settings, config.policy, state.seconds, provenance, outcomes)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -363,8 +363,8 @@ class InnerStepBench:
                 weights.append(relative_change(adapted, self.params))
                 for batch, changes in ((support, support_losses), (query, query_losses)):
                     changes.append(self.loss(adapted, batch) / self.loss(self.params, batch) - 1)
-            plain, _, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=0.0)
-            gradient, _, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=inner_lr)
+            plain, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=0.0)
+            gradient, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=inner_lr)
             gradients.append(relative_change(gradient, plain))
         return (
             float(np.median(weights)),

@@ -22,6 +22,7 @@ import common
 import data
 import evaluate
 import model
+import report
 import simulator
 import tests.unseen
 
@@ -173,15 +174,17 @@ def test_the_policy_that_ships_opens_windows(recorded, monkeypatch):
     """Guards it against everything that it depends on: text weights, camera, sampling, layers."""
     task, meta_world = "window-open", simulator.simulator_of("ml10")
     text, _ = clip.text_features([meta_world.instructions[task]], "random")
-    successes = evaluate.evaluate_checkpoint(
+    outcomes = evaluate.evaluate_checkpoint(
         evaluate.SHIPPED_CHECKPOINT,
         meta_world,
         recordings={task: recorded / f"{task}.npz"},
         text={task: text[0]},
         episodes=10,
         seed=0,
-    )[task]
-    assert len(successes) == 10 and sum(successes) >= 8
+        stop_at_success=True,  # quicker
+    )
+    assert len(outcomes.any_step[task]) == 10 and sum(outcomes.any_step[task]) >= 8
+    assert outcomes.at_end is None
 
 
 def test_any_simulator_is_recorded_and_rolled_out_in_by_its_protocol(monkeypatch, recordings):
@@ -193,21 +196,34 @@ def test_any_simulator_is_recorded_and_rolled_out_in_by_its_protocol(monkeypatch
         [ToySimulator().make("touch-red", 64) for _ in range(2)],
     )
 
-    def roll_out():
+    def roll_out(stop_at_success):
         return evaluate.rollout(
-            policy, toys, [5, 6], sampler, text, torch.Generator().manual_seed(0)
+            policy,
+            toys,
+            [5, 6],
+            sampler,
+            text,
+            torch.Generator().manual_seed(0),
+            stop_at_success=stop_at_success,
         )
 
-    assert all(type(success) is bool for success in roll_out())
+    for of_steps in roll_out(stop_at_success=False):
+        assert len(of_steps) == 12 and all(type(success) is bool for success in of_steps)
 
     def ask_the_experts(points, state, context, generator):
         actions = np.stack([env.expert_action() for env in toys])
         return torch.from_numpy(actions)[:, None].expand(-1, 8, -1)
 
     monkeypatch.setattr(policy, "sample_actions", ask_the_experts)
-    assert roll_out() == [True, True] and all(env.steps < 12 for env in toys)
+    stopped = roll_out(stop_at_success=True)
+    assert all(of_steps.index(True) == len(of_steps) - 1 < 11 for of_steps in stopped)
+    assert [env.steps for env in toys] == [len(of_steps) for of_steps in stopped]
+    whole = roll_out(stop_at_success=False)
+    assert all(
+        of_steps[-1] and env.steps == len(of_steps) == 12 for of_steps, env in zip(whole, toys)
+    )
     monkeypatch.setattr(policy, "sample_actions", lambda *inputs: -ask_the_experts(*inputs))
-    assert roll_out() == [False, False] and all(env.steps == 12 for env in toys)
+    assert roll_out(stop_at_success=True) == [[False] * 12] * 2
 
 
 def test_clouds_with_colors_are_rolled_out_on(recordings):
@@ -231,8 +247,9 @@ def test_in_worker_processes_the_episodes_are_the_same(run, recordings, monkeypa
         )
 
     here = measure()
-    assert {len(successes) for successes in here.values()} == {10}
-    assert 5 < sum(sum(successes) for successes in here.values()) < 25  # they could differ
+    assert {len(successes) for successes in here.any_step.values()} == {10}
+    assert {len(successes) for successes in here.at_end.values()} == {10}
+    assert 5 < sum(sum(successes) for successes in here.any_step.values()) < 25  # could differ
     monkeypatch.setattr(evaluate, "run_jobs", common.run_jobs)
     assert measure(workers=2) == here
     assert "evaluating: 100%" in capsys.readouterr().err
@@ -244,7 +261,7 @@ def test_ten_episodes_are_rolled_out_side_by_side(run, recordings, monkeypatch):
 
     def count(policy, *, environments, seeds, generator, **_):
         calls.append((len(environments), list(seeds), generator.initial_seed()))
-        return [True] * len(seeds)
+        return [[True]] * len(seeds)
 
     monkeypatch.setattr(evaluate, "rollout", count)
     text = dict.fromkeys(TASKS, torch.zeros(512))
@@ -276,7 +293,7 @@ def test_each_task_has_its_own_environments_and_its_first_demonstrations(
 
     def keep(policy, *, sampler, seeds, **_):
         read.append((sampler.task, len(sampler.episodes)))
-        return [True] * len(seeds)
+        return [[True]] * len(seeds)
 
     monkeypatch.setattr(evaluate, "rollout", keep)
     evaluate.evaluate_checkpoint(
@@ -411,7 +428,7 @@ def test_each_rollout_holds_a_demonstration_of_its_own_from_beginning_to_end(mon
     long = [30, 5, 24, 17, 39]  # steps of each rollout: some end before others
     envs, generator = [Corridor(n) for n in long], torch.Generator().manual_seed(3)
     successes = evaluate.rollout(policy, envs, range(5), sampler, torch.zeros(512), generator)
-    assert successes == [True] * 5
+    assert successes == [[False] * (n - 1) + [True] for n in long]
 
     again = torch.Generator().manual_seed(3)  # all are drawn before any noise
     drawn = [sampler.sample_episode(again) for _ in long]
@@ -437,10 +454,43 @@ def walk(monkeypatch, corridor, config=model.PRESETS["tiny"], **options):
     return successes, demonstrations, states
 
 
-def test_a_rollout_ends_with_its_first_success_or_with_the_episode(monkeypatch):
+def test_a_rollout_says_of_each_step_whether_it_was_a_success(monkeypatch):
     for successful in (True, False):
         corridor = Corridor(20, successful)
-        assert walk(monkeypatch, corridor)[0] == [successful] and corridor.steps == 20
+        [of_steps], _, _ = walk(monkeypatch, corridor)
+        assert of_steps == [False] * 19 + [successful] and corridor.steps == 20
+
+
+class Passing(Corridor):
+    """A success at the tenth step, and never again."""
+
+    def advance(self, action):
+        reward, truncated, _ = super().advance(action)
+        return reward, truncated, {"success": self.steps == 10}
+
+
+def test_an_episode_is_played_to_its_end_unless_it_stops_at_its_first_success(monkeypatch):
+    [of_steps], _, _ = walk(monkeypatch, Passing(20))
+    assert of_steps == [step == 10 for step in range(1, 21)]
+    [of_steps], _, _ = walk(monkeypatch, Passing(20), stop_at_success=True)
+    assert of_steps == [step == 10 for step in range(1, 11)]
+
+
+def test_success_at_any_step_and_at_the_end_are_counted_apart(run, recordings, monkeypatch):
+    of_steps = [[False, True, False], [False, True, True], [False, False, False]]
+    monkeypatch.setattr(evaluate, "rollout", lambda policy, **_: of_steps)
+    arguments = {
+        "checkpoint": run / "ema-00006.pt",
+        "simulator": ToySimulator(),
+        "recordings": {"touch-red": recordings["touch-red"]},
+        "text": {"touch-red": torch.zeros(512)},
+        "episodes": 3,
+    }
+    outcomes = evaluate.evaluate_checkpoint(**arguments)
+    assert outcomes.any_step == {"touch-red": [True, True, False]}
+    assert outcomes.at_end == {"touch-red": [False, True, False]}
+    stopped = evaluate.evaluate_checkpoint(**arguments, stop_at_success=True)
+    assert stopped.any_step == outcomes.any_step and stopped.at_end is None
 
 
 def test_the_policy_reads_the_older_frame_first_and_the_newest_last(monkeypatch):
@@ -470,7 +520,7 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
     [label] = written["successes"]
     assert label == "toy-tiny-seed0/ema-00006" and "checkpoints" not in written
     text, _ = features(["touch-red", "touch-green"], None, None)
-    assert written["successes"][label] == evaluate.evaluate_checkpoint(
+    outcomes = evaluate.evaluate_checkpoint(
         run / "ema-00006.pt",
         ToySimulator(),
         {task: recordings[task] for task in TASKS},
@@ -479,6 +529,8 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
         seed=3,
         n_demonstrations=2,
     )
+    assert written["successes"][label] == outcomes.any_step
+    assert written["successes at the end"][label] == outcomes.at_end
     provenance = written["provenance"]
     assert provenance["title"] == "toy, base tasks" and provenance["episodes a task"] == 5
     assert provenance["seed"] == 3 and provenance["text weights"] == "words"
@@ -493,7 +545,8 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
 
 def test_the_best_checkpoints_of_a_run_are_averaged(run, recordings, monkeypatch, capsys):
     def measured(checkpoint, recordings, **_):
-        return {task: [checkpoint.stem == "ema-00003", True] for task in recordings}
+        of_tasks = {task: [checkpoint.stem == "ema-00003", True] for task in recordings}
+        return report.Outcomes(any_step=of_tasks, at_end=of_tasks)
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
     evaluate.main(command(run, recordings, "--episodes 2 --top 1 --out report"))
@@ -511,7 +564,8 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordi
     def measured(checkpoint, recordings, text, **options):
         read = {task: path.stem for task, path in recordings.items()}
         calls.append((read, text, options))
-        return {task: [len(calls) == 1] * options["episodes"] for task in recordings}
+        of_tasks = {task: [len(calls) == 1] * options["episodes"] for task in recordings}
+        return report.Outcomes(any_step=of_tasks, at_end=of_tasks)
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
     swap = "--swap demonstration instruction --episodes 2"
@@ -546,10 +600,11 @@ def test_what_the_command_line_says_reaches_the_rollouts(run, recordings, traine
 
     def measured(checkpoint, recordings, text, **options):
         calls.append((checkpoint, list(recordings), text, options))
-        return {task: [True] for task in recordings}
+        return report.Outcomes(any_step={task: [True] for task in recordings}, at_end=None)
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
-    flags = "--task touch-green --known-goals --seed 3 --episodes 4 --workers 2 --sampler ddim"
+    flags = "--task touch-green --known-goals --seed 3 --episodes 4 --workers 2 --sampler ddim "
+    flags += "--stop-at-success"
     evaluate.main(command(run, recordings, flags))
     [(checkpoint, tasks, text, options)] = calls
     assert checkpoint == run / "ema-00006.pt" and tasks == ["touch-green"]
@@ -563,6 +618,7 @@ def test_what_the_command_line_says_reaches_the_rollouts(run, recordings, traine
         "n_demonstrations": 2,
         "zero_demonstration": False,
         "known_goals": True,
+        "stop_at_success": True,
         "config_overrides": {"sampler": "ddim"},
     }
     provenance = report_of("runs/evaluation")["provenance"]
@@ -577,7 +633,7 @@ def test_a_policy_that_was_adapted_without_its_instruction_is_not_given_one(
 
     def measured(checkpoint, recordings, text, **_):
         texts.extend(text.values())
-        return {task: [True] for task in recordings}
+        return report.Outcomes(any_step={task: [True] for task in recordings}, at_end=None)
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
     info = {**INFO, "adapted_to": "touch-blue", "adaptation": {"instruction": False}}
@@ -657,9 +713,7 @@ def test_a_rollout_can_be_watched(run, recordings, capsys):
 
 def test_every_second_step_and_the_last_moment_are_filmed(trained, recordings, monkeypatch):
     films = []
-    monkeypatch.setattr(
-        evaluate, "animate", lambda frames, title, *_: films.append((frames, title))
-    )
+    monkeypatch.setattr(evaluate, "animate", lambda frames, task, *_: films.append((frames, task)))
     sampler = data.WindowSampler(data.load_demonstrations(recordings["touch-red"]), TINY)
     made = []
 
@@ -669,12 +723,14 @@ def test_every_second_step_and_the_last_moment_are_filmed(trained, recordings, m
             return made[-1]
 
     text, _ = features(["touch-red"], None, None)
-    success = evaluate.write_animation(
+    successes = evaluate.write_animation(
         trained, Kept(), sampler, text[0], seed=2, path=Path("x.gif")
     )
-    [(frames, title)], [environment] = films, made
-    assert title == f"touch-red: {'success' if success else 'failure'}"
+    [(frames, task)], [environment] = films, made
+    assert task == "touch-red" and environment.steps == len(successes) == 12
     assert [frame.step for frame in frames] == [*range(0, environment.steps, 2), environment.steps]
+    outcome_before = [False, *successes]  # nothing is told before it happens
+    assert [frame.success for frame in frames] == [outcome_before[f.step] for f in frames]
     np.testing.assert_array_equal(frames[-1].cloud, environment.observe()["point_cloud"])
     np.testing.assert_array_equal(frames[-1].picture, environment.render())
     assert not np.array_equal(frames[0].picture, frames[-1].picture)
@@ -686,7 +742,7 @@ def test_every_second_step_and_the_last_moment_are_filmed(trained, recordings, m
         text[0],
         torch.Generator().manual_seed(simulator.evaluation_seed(2, 0)),
     )
-    assert again == success
+    assert again == successes
 
 
 def test_an_adapted_policy_is_watched_from_its_folder(
@@ -694,7 +750,9 @@ def test_an_adapted_policy_is_watched_from_its_folder(
 ):
     seen = []
     monkeypatch.setattr(
-        evaluate, "write_animation", lambda p, s, sampler, *_, **__: seen.append(sampler.task)
+        evaluate,
+        "write_animation",
+        lambda p, s, sampler, *_, **__: (seen.append(sampler.task), [False])[1],
     )
     Path("all/touch-blue").mkdir(parents=True)
     model.save("all/touch-blue/adapted.pt", trained, **{**INFO, "adapted_to": "touch-blue"})

@@ -16,6 +16,7 @@ import data
 import evaluate
 import finetune
 import model
+import report
 
 pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
 
@@ -56,7 +57,8 @@ def evaluated(monkeypatch, successes):
 
     def evaluate_checkpoint(*, checkpoint, recordings, **options):
         calls.append(options)
-        return {task: successes(checkpoint) for task in recordings}
+        of_tasks = {task: successes(checkpoint) for task in recordings}
+        return report.Outcomes(any_step=of_tasks, at_end=of_tasks)
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", evaluate_checkpoint)
     return calls
@@ -77,7 +79,8 @@ def test_finetuning_needs_only_a_task_and_reports_before_and_after(recorded, cap
     assert all(len(column["door-close"]) == 1 for column in columns.values())
     printed = capsys.readouterr().out
     assert "using the policy that comes with the code" in printed and "adapted to" in printed
-    assert re.search(r"\| before +\| after +\| paper, DAMI +\|", printed)
+    columns = ("before", "after", "before, at the end", "after, at the end", "paper, DAMI")
+    assert re.search(r" +\| ".join(columns), printed)
     assert re.search(r"\| steps +\| 4 +\| 200 +\|", printed)  # the settings
     assert [line["step"] for line in metrics(folder)] == [1, 2, 3, 4]
 

@@ -89,20 +89,23 @@ def test_held_out_errors_have_a_row_for_each_task_and_the_mean():
 
 
 def test_a_report_is_a_table_a_chart_and_every_episode_with_its_provenance(tmp_path):
-    columns = {"run/ema": {"reach": [True, False]}}
-    earlier = {"run/ema-1": {"reach": [False, False]}}
+    any_step, at_end = {"reach": [True, True]}, {"reach": [True, False]}
+    earlier = {"reach": [False, False]}
     table = report.write_report(
         tmp_path / "report",
-        columns,
+        {"run/ema": report.Outcomes(any_step, at_end), "stopped": report.Outcomes(earlier, None)},
         {"title": "A title", "seed": 7},
         paper=report.paper_columns("ml10", ["dami"]),
-        checkpoints=earlier,
+        checkpoints={"run/ema-1": report.Outcomes(earlier, None)},
     )
+    titles = ["task", "run/ema", "stopped", "run/ema, at the end", "paper, DAMI"]
+    assert [cell.strip() for cell in table.splitlines()[0].strip("|").split("|")] == titles
     written = json.loads((tmp_path / "report" / "success.json").read_text())
     assert written == {
         "provenance": {"title": "A title", "seed": 7},
-        "successes": columns,
-        "checkpoints": earlier,
+        "successes": {"run/ema": any_step, "stopped": earlier},
+        "successes at the end": {"run/ema": at_end},
+        "checkpoints": {"run/ema-1": earlier},
     }
     text = (tmp_path / "report" / "success.md").read_text()
     assert text.startswith(table) and "58.7" in table and "title A title, seed 7." in text

@@ -107,7 +107,7 @@ def test_a_network_is_a_class_and_a_line(here, own_folder, monkeypatch):
     policy, _ = model.load("run/ema-00001.pt")
     assert isinstance(policy.denoiser, ToyMLP) and policy.config.denoiser == "toy-mlp"
     assert policy.reads_task and policy.reads_demonstration
-    assert all("loss_before" in line for line in metrics(own_folder / "run"))  # an inner step each
+    assert "loss_before" in metrics(own_folder / "run")[0]  # there was an inner step
 
     # Its learning rate in adaptation is that of a denoiser, whatever it is called.
     rates = "--lr-vision 0 --lr-other 0 --lr-diffusion 1e-3"
