@@ -219,9 +219,7 @@ def test_any_simulator_is_recorded_and_rolled_out_in_by_its_protocol(monkeypatch
     assert all(of_steps.index(True) == len(of_steps) - 1 < 11 for of_steps in stopped)
     assert [env.steps for env in toys] == [len(of_steps) for of_steps in stopped]
     whole = roll_out(stop_at_success=False)
-    assert all(
-        of_steps[-1] and env.steps == len(of_steps) == 12 for of_steps, env in zip(whole, toys)
-    )
+    assert all(any(of_steps) and len(of_steps) == 12 for of_steps in whole)
     monkeypatch.setattr(policy, "sample_actions", lambda *inputs: -ask_the_experts(*inputs))
     assert roll_out(stop_at_success=True) == [[False] * 12] * 2
 
