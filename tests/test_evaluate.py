@@ -330,6 +330,7 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
             text=np.zeros(512, np.float32),
             seeds=[simulator.evaluation_seed(0, episode)],
             zero_demonstration=False,
+            stop_at_success=True,
         )
         return np.stack(frames)
 
@@ -345,7 +346,7 @@ def test_known_goals_are_those_of_the_demonstrations(run, recordings, monkeypatc
 
     def keep_seeds(policy, **options):
         seeds.extend(options["seeds"])
-        return [True] * len(options["seeds"])
+        return [[True]] * len(options["seeds"])
 
     monkeypatch.setattr(evaluate, "rollout", keep_seeds)
     text = {"touch-red": torch.zeros(512)}
@@ -655,7 +656,7 @@ def test_a_run_of_another_policy_stands_beside_that_policys_published_numbers(
     monkeypatch.setattr(
         evaluate,
         "evaluate_checkpoint",
-        lambda recordings, **_: {task: [True] for task in recordings},
+        lambda recordings, **_: report.Outcomes({task: [True] for task in recordings}, None),
     )
     renamed = dict(zip(("reach", "push"), recordings.values()))
     monkeypatch.setattr(evaluate, "collect", lambda *_, **__: renamed)
