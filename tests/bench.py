@@ -1,20 +1,26 @@
 """Times the pieces that matter, on this machine, side by side: `python -m tests.bench [--paper]`.
 
-`--network` leaves out what a GPU has no part in: frames, episodes, and memory.
+`--network` leaves out what a GPU has no part in: frames, episodes, and memory. `--peers FOLDER`
+times the second-order meta-gradient of learn2learn and higher beside ours.
 
 Each figure is the median of the repetitions; what is compared takes turns, so that a slow minute of
 the machine meets all of it. The first round is not counted. Nothing else should be running.
 """
 
 import argparse
+import atexit
+import shutil
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -415,6 +421,109 @@ def print_inner_step(checkpoint: Path, folder: str, inner_lr: float | None) -> N
         print(f"| {title} (medians) | {cells} |", flush=True)
 
 
+# ---- Second-order MAML of other libraries --------------------------------------------------------
+
+PEERS = {  # archive on PyPI -> the package in it
+    "learn2learn-0.2.0.tar.gz": "learn2learn",
+    "higher-0.2.1-py3-none-any.whl": "higher",
+}
+
+
+def unpack_peers(folder: Path) -> list[str]:
+    """Makes the packages in a folder's archives importable; returns those that are there.
+
+    They are not installed, since neither builds with a current Python, nor are their `__init__`
+    files run, which import much that MAML does not need.
+    """
+    found = []
+    unpacked = Path(tempfile.mkdtemp(prefix="peers-"))
+    atexit.register(shutil.rmtree, unpacked, ignore_errors=True)
+    for archive, package in PEERS.items():
+        if not (folder / archive).is_file():
+            print(f"{folder / archive} is missing, and is left out: download it from PyPI")
+            continue
+        file_format = "zip" if archive.endswith(".whl") else "gztar"
+        shutil.unpack_archive(folder / archive, unpacked / package, file_format)
+        [source] = [path for path in unpacked.glob(f"{package}/**/{package}") if path.is_dir()]
+        for name, place in ((package, source), (f"{package}.algorithms", source / "algorithms")):
+            sys.modules[name] = ModuleType(name)
+            sys.modules[name].__path__ = [str(place)]
+        found.append(package)
+    return found
+
+
+def learn2learn_gradient(policy: DAMIPolicy, pairs: list[tuple[Batch, Batch]], lr: float) -> None:
+    """The gradient of the mean query loss, left in the parameters' `grad`, by learn2learn."""
+    learner = import_module("learn2learn.algorithms.maml").MAML(policy, lr=lr)
+    for support, query in pairs:
+        adapted = learner.clone()
+        adapted.adapt(adapted(**support))
+        (adapted(**query) / len(pairs)).backward()
+
+
+def higher_gradient(policy: DAMIPolicy, pairs: list[tuple[Batch, Batch]], lr: float) -> None:
+    """The same by higher."""
+    patch, optim = import_module("higher.patch"), import_module("higher.optim")
+    optimizer = torch.optim.SGD(policy.parameters(), lr=lr)
+    for support, query in pairs:
+        adapted = patch.monkeypatch(policy, copy_initial_weights=False, track_higher_grads=True)
+        inner = optim.get_diff_optim(optimizer, policy.parameters(), fmodel=adapted)
+        inner.step(adapted(**support))
+        (adapted(**query) / len(pairs)).backward()
+
+
+def autograd_gradient(policy: DAMIPolicy, pairs: list[tuple[Batch, Batch]], lr: float) -> None:
+    """The same by plain autograd, task by task."""
+    parameters = dict(policy.named_parameters())
+    for support, query in pairs:
+        gradients = torch.autograd.grad(
+            policy(**support), list(parameters.values()), create_graph=True
+        )
+        adapted = {name: p - lr * g for (name, p), g in zip(parameters.items(), gradients)}
+        (functional_call(policy, adapted, (), query) / len(pairs)).backward()
+
+
+def print_peers(folder: Path, recording: Demonstrations, device: torch.device, repeat: int) -> None:
+    """The time of a second-order meta-gradient of ten tasks, ours and others', taking turns."""
+    bench = Bench(PRESETS["small"], "small", recording, device)
+    settings, policy = bench.settings, bench.policy
+    batches = bench.batches(10)
+    pairs = [split(batch, settings.support) for batch in batches]
+    ours, _ = meta_gradient(
+        partial(loss_of, policy),
+        dict(policy.named_parameters()),
+        pairs,
+        lr=settings.inner_lr,
+        vectorize=settings.vectorize,
+    )
+    others = {"plain autograd, task by task": autograd_gradient}
+    found = unpack_peers(folder)
+    if "learn2learn" in found:
+        others["learn2learn 0.2.0"] = learn2learn_gradient
+    if "higher" in found:
+        others["higher 0.2.1"] = higher_gradient
+
+    calls = {
+        "this code": partial(bench.outer_step, batches, first_order=False),
+        "this code, task by task": partial(
+            bench.outer_step, batches, first_order=False, vectorize=1
+        ),
+    }
+    for name, gradient_of in others.items():
+        calls[name] = partial(gradient_of, policy, pairs, settings.inner_lr)
+    for name in others:  # they agree
+        policy.zero_grad()
+        calls[name]()
+        theirs = {name: parameter.grad.clone() for name, parameter in policy.named_parameters()}
+        print(f"{name}: differs from this code's by {relative_change(theirs, ours):.1e}")
+    policy.zero_grad()
+    ms = medians(calls, repeat)
+    print("\n| second-order meta-gradient, `small`, 10 tasks | ms | over this code's |")
+    print("|---|---|---|")
+    for name, value in ms.items():
+        print(f"| {name} | {value:.0f} | {value / ms['this code']:.2f} |", flush=True)
+
+
 # ---- Tables --------------------------------------------------------------------------------------
 
 
@@ -567,6 +676,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("--paper", action="store_true", help="the paper's size too (10 minutes more, 16 GB)")
     add("--network", action="store_true", help="only the network's steps")
+    add(
+        "--peers",
+        type=Path,
+        metavar="FOLDER",
+        help="only other libraries' second-order MAML beside ours: the folder has their archives "
+        f"from PyPI, {' and '.join(PEERS)}",
+    )
     add("--inner-step", action="store_true", help="only what it does to a policy")
     add("--data", default="data", help="demonstrations that --inner-step reads")
     add("--inner-lr", type=float, help="its rate (default: of the training)")
@@ -589,9 +705,12 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     threads, today = torch.get_num_threads(), time.strftime("%Y-%m-%d")
     print(f"{hardware(device)}, torch {torch.__version__}, {threads} threads, {today}")
-    if not args.network:
+    if not (args.network or args.peers):
         print_simulator(device, args.repeat)
     recording = demonstration("drawer-close")
+    if args.peers:
+        print_peers(args.peers, recording, device, args.repeat)
+        return
     rate = matrix_rate(device)
     print(f"\nmatrix product: {rate:.0f} GFLOP a second")
     for preset in ("small", "tiny"):
