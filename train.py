@@ -123,13 +123,13 @@ class Settings:
 SETTINGS = {
     "paper": Settings(),
     "small": Settings(
-        preset="small", steps=9_000, support=4, query=12, lr=1e-3, warmup=100,
+        preset="small", steps=8_000, support=4, query=12, lr=1e-3, warmup=100,
         pretrain_fraction=0.9,  # a third of the time, nearly the same gradient
         after_success=20,  # three fifths of the experts' frames are later ...
         late_fraction=0.15,  # ... and show how to stay; many of them cost success elsewhere
         instruction_dropout=0.2,  # otherwise the policy ignores the demonstration
         task_dropout=0.25, inner_lr=3e-3,  # without task inputs the inner step must find the task
-        vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=9_000,
+        vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=8_000,
     ),
     "tiny": Settings(
         preset="tiny", steps=30, support=4, query=8, inner_lr=1e-3, lr=3e-3, warmup=5, vectorize=10,
