@@ -1050,6 +1050,8 @@ class GroupNorm(nn.GroupNorm):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, channels, L) -> (B, channels, L)."""
+        if not torch.is_grad_enabled():
+            return super().forward(x)
         groups = x.unflatten(1, (self.num_groups, -1)).flatten(2)  # (B, groups, channels / .. * L)
         x = F.layer_norm(groups, groups.shape[-1:], eps=self.eps).view_as(x)
         return x * self.weight[:, None] + self.bias[:, None]
@@ -1059,6 +1061,8 @@ class Mish(nn.Module):
     """x tanh(log(1 + e^x)): faster than PyTorch's own, above all in the second derivative."""
 
     def forward(self, x: Tensor) -> Tensor:
+        if not torch.is_grad_enabled():
+            return F.mish(x)
         return x * torch.tanh(F.softplus(x))
 
 

@@ -412,6 +412,33 @@ def test_windows_begin_up_to_so_many_frames_after_the_first_success():
     assert len(WindowSampler(untold, SIZES, after_success=5)) == len(every)
 
 
+def test_late_windows_are_drawn_as_often_as_asked_for_and_come_in_a_random_order():
+    recorded = replace(recording((40, 30)), meta={"success_frames": [10, 28]})
+    sampler = WindowSampler(recorded, SIZES, after_success=5, late_fraction=0.25)
+    every = WindowSampler(recorded, SIZES)
+    assert torch.equal(sampler.windows, every.windows)
+    starts = sampler.windows[:, 0]
+    assert torch.equal(sampler.late, (starts > 15) & (sampler.episode_of == 0))
+
+    late_starts = torch.arange(
+        16, 40
+    )  # of the first episode, whose windows are told by their frames
+    places, n_late = [], 0
+    for seed in range(400):
+        chosen = sampler.sample(8, seeded(seed))["action"][:, 0]  # (8, A)
+        is_late = (chosen[:, None] == sampler.action[late_starts]).all(-1).any(-1)  # (8,)
+        n_late += int(is_late.sum())
+        places += torch.nonzero(is_late).flatten().tolist()
+    assert n_late == pytest.approx(0.25 * 8 * 400, rel=0.1)
+    assert np.bincount(places, minlength=8).min() > 0.7 * n_late / 8  # support and query alike
+
+
+def test_without_late_windows_all_that_are_drawn_are_early():
+    recorded = replace(recording((40, 30)), meta={"success_frames": [39, 29]})
+    sampler = WindowSampler(recorded, SIZES, after_success=5, late_fraction=0.5)
+    assert not sampler.late.any() and len(sampler.sample(8, seeded(0))["action"]) == 8
+
+
 def test_a_batch_is_drawn_in_an_order_that_never_changes():
     """Results belong to a seed: first the reference, then the windows of the other episodes."""
     sampler = WindowSampler(recording((40, 30, 50)), SIZES)
