@@ -28,6 +28,7 @@ import zipfile
 from collections import OrderedDict
 from collections.abc import Sequence
 from functools import lru_cache
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 
@@ -262,8 +263,47 @@ def read_official(path: Path) -> CLIPTextEncoder:
     return CLIPTextEncoder(weights, f"openai-ViT-B-32-{CLIP_SHA256[:8]}")
 
 
+# Where OpenAI's names and Hugging Face's differ, the longer ones before their beginnings. Queries,
+# keys and values, which stand in one tensor at OpenAI, are put together in `as_openai_names_them`.
+HUGGING_FACE_NAMES = {
+    "token_embedding.weight": "text_model.embeddings.token_embedding.weight",
+    "positional_embedding": "text_model.embeddings.position_embedding.weight",
+    "transformer.resblocks.": "text_model.encoder.layers.",
+    "ln_final.": "text_model.final_layer_norm.",
+    ".attn.": ".self_attn.",
+    ".ln_1.": ".layer_norm1.",
+    ".ln_2.": ".layer_norm2.",
+    ".mlp.c_fc.": ".mlp.fc1.",
+    ".mlp.c_proj.": ".mlp.fc2.",
+}
+
+
+def as_openai_names_them(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Renames the text tensors of a Hugging Face CLIP model; other state dicts stay as they are.
+
+    `CLIPModel`, `CLIPTextModel` and `CLIPTextModelWithProjection` name them alike.
+    """
+    if not any(name.startswith("text_model.") for name in weights):
+        return weights
+    renamed = {}
+    for name, tensor in weights.items():
+        for openai, hugging_face in HUGGING_FACE_NAMES.items():
+            name = name.replace(hugging_face, openai)
+        renamed[name] = tensor
+    for block in {name.split(".attn.")[0] for name in renamed if ".attn.q_proj." in name}:
+        for kind in ("weight", "bias"):
+            parts = [renamed.get(f"{block}.attn.{x}_proj.{kind}") for x in "qkv"]
+            if all(part is not None for part in parts):
+                renamed[f"{block}.attn.in_proj_{kind}"] = torch.cat(parts)
+    if "text_projection.weight" in renamed:  # a linear layer holds its matrix transposed
+        renamed["text_projection"] = renamed["text_projection.weight"].T.contiguous()
+    return renamed
+
+
 def read_clip_file(path: Path) -> CLIPTextEncoder:
     """The text tower of a file the user gave: OpenAI's own, or a plain state dict, never unpickled.
+
+    The state dict has OpenAI's names or Hugging Face's, and can be a .safetensors file.
 
     Raises TextWeightsError for a file that is missing, cut off, or neither of the two.
     """
@@ -285,7 +325,12 @@ def read_clip_file(path: Path) -> CLIPTextEncoder:
             f"{CLIP_SHA256[:8]}...; fetch ViT-B-32.pt again, or give a plain state dict"
         )
     try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)
+        if path.suffix == ".safetensors":
+            weights = import_module("safetensors.torch").load_file(path)
+        else:
+            weights = torch.load(path, map_location="cpu", weights_only=True)
+    except ModuleNotFoundError:
+        raise TextWeightsError(f"{path}: to read it, pip install safetensors") from None
     except Exception as error:  # a damaged file fails in a dozen ways
         reason = str(error).split("\n")[0]
         raise TextWeightsError(
@@ -293,7 +338,7 @@ def read_clip_file(path: Path) -> CLIPTextEncoder:
         ) from None
     if not isinstance(weights, dict) or not all(isinstance(x, Tensor) for x in weights.values()):
         raise TextWeightsError(f"{path}: neither CLIP's ViT-B-32.pt nor a plain state dict")
-    return CLIPTextEncoder(weights, f"state-dict-{sha256[:8]}")
+    return CLIPTextEncoder(as_openai_names_them(weights), f"state-dict-{sha256[:8]}")
 
 
 def download_clip(path: Path) -> None:
@@ -340,7 +385,8 @@ def load_clip_text_encoder(
     """Returns CLIP's text tower: from `weights`, else the cache, else downloaded, else random.
 
     Args:
-        weights: OpenAI's ViT-B-32.pt, a plain state dict with its names, or "random".
+        weights: OpenAI's ViT-B-32.pt, a plain state dict with its names or Hugging Face's, or
+            "random".
         seed: draws the random weights, used with a warning where the official ones cannot be had.
         download: False keeps off the network.
 

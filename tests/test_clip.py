@@ -15,6 +15,7 @@ import ftfy
 import pytest
 import torch
 import transformers
+from safetensors.torch import save_file
 from torch import nn
 from transformers.modeling_utils import no_init_weights
 
@@ -183,7 +184,7 @@ def half(weights):
     }
 
 
-def test_text_features_equal_those_of_transformers(weights):
+def test_text_features_and_weights_equal_those_of_transformers(weights, tmp_path):
     config = transformers.CLIPTextConfig(bos_token_id=49406, eos_token_id=49407)
     with no_init_weights():
         peer = transformers.CLIPTextModelWithProjection(config).eval()
@@ -218,6 +219,18 @@ def test_text_features_equal_those_of_transformers(weights):
     features = clip.CLIPTextEncoder(weights, "test").encode(texts)
     assert features.shape == (len(texts), 512) and features.dtype == torch.float32
     torch.testing.assert_close(features, expected, rtol=0, atol=1e-5)
+
+    # The state dict of transformers' model is read as it is
+    pickled, safe = tmp_path / "pytorch_model.bin", tmp_path / "model.safetensors"
+    torch.save(peer.state_dict(), pickled)
+    save_file({name: x.contiguous() for name, x in peer.state_dict().items()}, safe)
+    for path in (pickled, safe):
+        loaded = load_clip_text_encoder(path).state_dict()
+        assert all(torch.equal(loaded[name], x) for name, x in weights.items())
+    del state["text_model.encoder.layers.3.self_attn.k_proj.bias"]
+    torch.save(state, pickled)
+    with pytest.raises(clip.TextWeightsError, match=r"resblocks.3.attn.in_proj_bias' is missing"):
+        load_clip_text_encoder(pickled)
 
 
 def test_a_text_has_the_same_features_alone_and_beside_longer_ones(weights):
