@@ -234,6 +234,11 @@ def format_table(rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in padded)
 
 
+def count(number: int, noun: str) -> str:
+    """`1 task`, `2 tasks`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def print_settings(used: dict[str, Any], default: dict[str, Any]) -> None:
     """Prints a table of a run's settings, with the default beside a value that differs from it."""
     rows = [["setting", "value", "default"]]

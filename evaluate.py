@@ -66,6 +66,7 @@ def rollout(
     generator: torch.Generator,
     zero_demonstration: bool = False,
     stop_at_success: bool = False,
+    on_steps: Callable[[int], None] | None = None,
 ) -> list[list[bool]]:
     """Rolls out E episodes of one task side by side, and says which of their steps were a success.
 
@@ -80,6 +81,7 @@ def rollout(
         generator: draws demonstrations and noise; on the CPU.
         zero_demonstration: the policy reads zeros in place of its demonstration.
         stop_at_success: an episode ends at its first success, and not when it is over.
+        on_steps: called with the number of steps that the episodes took since its last call.
 
     Returns:
         For each of E episodes, whether each step that was taken reported success.
@@ -118,12 +120,16 @@ def rollout(
             generator=generator,
         )  # (E, Ta, A)
 
+        taken = 0
         for e, chunk in zip(list(running), chunks):
             seen, of_steps, ended = take_actions(environments[e], chunk, To, stop_at_success)
             observations[e] = [*observations[e], *seen][-To:]
             successes[e] += of_steps
+            taken += len(of_steps)
             if ended:
                 running.remove(e)
+        if on_steps is not None:
+            on_steps(taken)
     return successes
 
 
@@ -187,6 +193,11 @@ def checkpoints_of(path: str | Path) -> list[Path]:
     # By the length first, since steps may have more than five digits
     by_step = sorted(path.glob("ema-*.pt"), key=lambda file: (len(file.name), file.name))
     found = by_step or list(path.glob("adapted.pt"))
+    if not found and (path / "last.pt").is_file():
+        raise UserError(
+            f"{path} is a run that was interrupted before its first checkpoint: add --resume to "
+            f"its training, or name {path / 'last.pt'}"
+        )
     if not found:
         adapted = ", ".join(str(file.parent) for file in sorted(path.glob("*/adapted.pt")))
         suggestion = adapted or "a folder of train.py or finetune.py, or a .pt file"
@@ -200,16 +211,22 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
     Runs of `tiny` do not count: they show that everything works, and succeed nearly nowhere.
     Raises UserError where there is neither.
     """
-    finished = []
+    finished, tiny = [], []
     for config in Path(runs).glob("*/config.json"):
         with suppress(OSError, ValueError, KeyError, TypeError):  # of a damaged file
             arguments = json.loads(config.read_text())["arguments"]
             last = config.parent / f"ema-{arguments['steps']:05d}.pt"
-            if arguments["suite"] == suite and arguments["preset"] != "tiny" and last.is_file():
-                finished.append(last)
+            if arguments["suite"] == suite and last.is_file():
+                (tiny if arguments["preset"] == "tiny" else finished).append(last)
     if finished:
         return max(finished, key=lambda path: path.stat().st_mtime)
     if suite != "ml10" or not SHIPPED_CHECKPOINT.is_file():
+        if tiny:
+            run = max(tiny, key=lambda path: path.stat().st_mtime).parent
+            raise UserError(
+                f"{run} is a run of `tiny`, which only shows that everything works, and is never "
+                f"taken unasked: train with --preset small, or add --checkpoint {run}"
+            )
         raise UserError(f"no finished run on {suite} in {runs}/: train one, or name a --checkpoint")
     print(f"no finished run in {runs}/: using the policy that comes with the code", flush=True)
     return SHIPPED_CHECKPOINT
@@ -274,6 +291,7 @@ def evaluate_checkpoint(
     known_goals: bool = False,
     stop_at_success: bool = False,
     config_overrides: dict[str, Any] | None = None,
+    description: str = "evaluating",
 ) -> Outcomes:
     """Rolls a checkpoint out on tasks of a simulator, in parallel processes.
 
@@ -291,6 +309,7 @@ def evaluate_checkpoint(
         known_goals: roll out on the demonstrations' goals, at most `episodes` of them, each once.
         stop_at_success: an episode ends at its first success; it is quicker.
         config_overrides: of the policy's configuration, see `inference_overrides`.
+        description: the progress bar's.
 
     Returns:
         The successes, in the order of the episodes. They do not depend on `workers`.
@@ -318,8 +337,9 @@ def evaluate_checkpoint(
         rollout_job,
         jobs,
         workers=workers,
-        total=sum(len(job["seeds"]) for job in jobs),
-        description="evaluating",
+        total=sum(len(job["seeds"]) for job in jobs) * simulator.episode_steps,
+        description=description,
+        unit="step",
         setup=partial(prepare_worker, checkpoint, simulator, str(device), config_overrides or {}),
     )
 
@@ -370,8 +390,10 @@ def rollout_job(
         generator=torch.Generator().manual_seed(seeds[0]),
         zero_demonstration=zero_demonstration,
         stop_at_success=stop_at_success,
+        on_steps=partial(report_progress, task),
     )
-    report_progress(task, len(seeds))
+    skipped = len(seeds) * worker_state["simulator"].episode_steps - sum(map(len, successes))
+    report_progress(task, skipped)  # the steps after a success that ended an episode
     return successes
 
 

@@ -451,6 +451,7 @@ def adapt_tasks(
                 device=text[task].device,
                 n_demonstrations=kept - settings.held_out,
                 config_overrides=config_overrides,
+                description=f"evaluating {column}",
             )
             of_column = results.setdefault(column, Outcomes({}, {}))
             of_column.any_step.update(outcomes.any_step)

@@ -232,13 +232,18 @@ def collect(
             }
             for task in missing_tasks(simulator, paths, episodes, seed)  # now, after waiting
         ]
-        run_jobs(
-            collect_task,
-            jobs,
-            workers=workers,
-            total=len(jobs) * episodes,
-            description="collecting",
-        )
+        try:
+            run_jobs(
+                collect_task,
+                jobs,
+                workers=workers,
+                total=len(jobs) * episodes,
+                description="collecting",
+            )
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"the tasks that were finished are kept in {folder}, the same command goes on"
+            ) from None
     return paths
 
 

@@ -598,7 +598,10 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--preset", help="paper, small or tiny (default: paper on CUDA, small on a CPU)"
     )
     group.add_argument("--data", help="folder of the demonstrations (default: data)")
-    group.add_argument("--out", help="folder of the run (default: runs/SUITE-PRESET-seedSEED)")
+    group.add_argument(
+        "--out",
+        help="folder of the run (default: runs/SUITE-PRESET-seedSEED; own: own-DATA for SUITE)",
+    )
     group.add_argument("--resume", action="store_true", help="go on from the run's last.pt")
     common.add_common_flags(group)
 
@@ -723,12 +726,15 @@ def check_folder(folder: Path, resume: bool) -> None:
 def begin_log(
     folder: Path, step: int, settings: Settings, config: PolicyConfig, provenance: dict[str, Any]
 ) -> None:
-    """Prints the settings, writes config.json, drops what was logged later than `step`."""
-    default = baselines.PRESETS[config.policy][settings.preset]
-    common.print_settings(
-        used={**asdict(settings), **asdict(config)},
-        default={**asdict(SETTINGS[settings.preset]), **asdict(default)},
-    )
+    """Writes config.json, drops what was logged later than `step`; prints new runs' settings."""
+    if step == 0:
+        default = baselines.PRESETS[config.policy][settings.preset]
+        common.print_settings(
+            used={**asdict(settings), **asdict(config)},
+            default={**asdict(SETTINGS[settings.preset]), **asdict(default)},
+        )
+    else:
+        print(f"going on after step {step} of {settings.steps}", flush=True)
     content = {**provenance, "arguments": asdict(settings), "config": asdict(config)}
     write_text(folder / "config.json", json.dumps(content, indent=1))
 
@@ -886,13 +892,15 @@ def main(argv: Sequence[str] | None = None) -> None:
         paths = {task: Path(args.data or "data") / f"{task}.npz" for task in base_tasks}
     settings = choose_settings(args, preset, suite, config)
     name = preset if config.policy == "dami" else f"{config.policy}-{preset}"
-    folder = Path(args.out or f"runs/{suite}-{name}-seed{settings.seed}")
+    trained_on = suite if simulator else f"own-{Path(args.data).resolve().name}"
+    folder = Path(args.out or f"runs/{trained_on}-{name}-seed{settings.seed}")
 
     device, rank, world = join_processes(device, tasks=len(paths))
     with common.locked(folder) if rank == 0 else nullcontext():
         if rank == 0:
             where = f"{device} ({common.hardware(device)})"
-            print(f"preset {name} on {where}, {len(paths)} tasks, in {folder}", flush=True)
+            tasks = common.count(len(paths), "task")
+            print(f"preset {name} on {where}, {tasks}, in {folder}", flush=True)
             check_folder(folder, args.resume)
             if simulator is not None:
                 collect(
