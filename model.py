@@ -805,16 +805,16 @@ class DAMIPolicy(nn.Module):
 
         A letter stands for a size that is not given, and that is the same in all inputs of a call.
         """
-        To, H = self.config.n_obs_steps, self.config.horizon
+        To, H, N = self.config.n_obs_steps, self.config.horizon, self.config.num_points
         P, S, A = self.config.point_dim, self.config.state_dim, self.config.action_dim
         return {
-            "points": ("B", To, "N", P),
+            "points": ("B", To, N, P),
             "state": ("B", To, S),
             "action": ("B", H, A),
             "noise": ("B", H, A),
             "timesteps": ("B",),
             "text": ("D", self.config.text_dim),
-            "demo_points": ("D", "T", "N", P),
+            "demo_points": ("D", "T", N, P),
             "demo_state": ("D", "T", S),
             "demo_action": ("D", "T", A),
         }
@@ -833,7 +833,12 @@ class DAMIPolicy(nn.Module):
             if x is None or tuple(x.shape) != expected:
                 found = "missing" if x is None else tuple(x.shape)
                 takes = str(expected).replace("'", "")
-                raise ValueError(f"{name} is {found}, the policy takes {takes}")
+                advice = ""
+                if "points" in name and x is not None and x.dim() == len(expected):
+                    N = self.config.num_points
+                    if x.shape[-2] > N:
+                        advice = f": `data.farthest_point_sample(cloud, {N})` draws so many points"
+                raise ValueError(f"{name} is {found}, the policy takes {takes}{advice}")
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
         """Draws what makes `loss` pure: noise (n, H, A) and timesteps (n,) int64."""

@@ -959,14 +959,18 @@ def test_where_only_the_demonstration_tells_the_task_it_is_read():
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"demo_points": None}, r"demo_points is missing, the policy takes \(D, T, N, 3\)"),
+        ({"demo_points": None}, r"demo_points is missing, the policy takes \(D, T, 64, 3\)"),
         ({"text": None}, r"text is missing, the policy takes \(D, 512\)"),
         ({"text": (512,)}, r"text is \(512,\), the policy takes \(D, 512\)"),
         ({"text": (1, 768)}, r"text is \(1, 768\), the policy takes \(1, 512\)"),
         ({"action": (6, 8, 4)}, r"action is \(6, 8, 4\), the policy takes \(6, 16, 4\)"),
-        ({"points": (2, 64, 3)}, r"points is \(2, 64, 3\), the policy takes \(B, 2, N, 3\)"),
-        ({"points": (64, 3)}, r"points is \(64, 3\), the policy takes \(B, 2, N, 3\)"),
-        ({"points": (6, 2, 3)}, r"points is \(6, 2, 3\), the policy takes \(B, 2, N, 3\)"),
+        ({"points": (2, 64, 3)}, r"points is \(2, 64, 3\), the policy takes \(B, 2, 64, 3\)"),
+        ({"points": (64, 3)}, r"points is \(64, 3\), the policy takes \(B, 2, 64, 3\)"),
+        ({"points": (6, 2, 3)}, r"points is \(6, 2, 3\), the policy takes \(B, 2, 64, 3\)"),
+        (
+            {"points": (6, 2, 512, 3)},
+            r"takes \(6, 2, 64, 3\): `data.farthest_point_sample\(cloud, 64",
+        ),
         ({"points": (6, 2, 64, 2)}, r"points is \(6, 2, 64, 2\), the policy takes \(6, 2, 64, 3\)"),
         ({"points": (6, 2, 64, 6)}, r"points is \(6, 2, 64, 6\), the policy takes \(6, 2, 64, 3\)"),
         ({"points": (6, 1, 64, 3)}, r"points is \(6, 1, 64, 3\), the policy takes \(6, 2, 64, 3\)"),
