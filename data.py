@@ -73,7 +73,7 @@ FLOATS = (np.float16, np.float32, np.float64)  # in this machine's byte order
 class Demonstrations:
     """Recorded episodes of one task, one after the other.
 
-    `meta` says how they were made, in values that JSON can hold. Four entries have a meaning here;
+    `meta` says how they were made, in values that JSON can hold. Five entries have a meaning here;
     each may be left out:
 
     - positions_in_state: k, where the first 3 k numbers of a state are k positions x, y, z in the
@@ -82,6 +82,7 @@ class Demonstrations:
     - success_frames: the frame of each episode's first success, counted from the episode's start.
     - workspace: two opposite corners of the box that holds the points, metres.
     - simulator: the name of the simulator that they were made in; own recordings have none.
+    - action_names: what the numbers of an action are called, for tables.
     """
 
     task: str
@@ -94,6 +95,12 @@ class Demonstrations:
 
     def __len__(self) -> int:
         return len(self.episode_ends)
+
+    @property
+    def action_names(self) -> list[str]:
+        """What the numbers of an action are called: as `meta` says, or by their places."""
+        places = range(self.action.shape[1])
+        return self.meta.get("action_names", [f"action[{place}]" for place in places])
 
     def episode(self, index: int) -> slice:
         """The frames of one episode."""
@@ -220,6 +227,11 @@ class Demonstrations:
         self.check_workspace()
         if "simulator" in self.meta and not isinstance(self.meta["simulator"], str):
             raise RecordingError(f"simulator must be a name, not {self.meta['simulator']!r}")
+        names, action_dim = self.action_names, self.action.shape[1]
+        if not isinstance(names, list) or [type(name) for name in names] != [str] * action_dim:
+            raise RecordingError(
+                f"action_names must be a list of {action_dim} names, not {names!r}"
+            )
 
     def check_positions_in_state(self) -> None:
         count = self.meta.get("positions_in_state", 0)
@@ -480,6 +492,7 @@ class WindowSampler:
     ) -> None:
         self.task = demonstrations.task
         self.instruction = demonstrations.instruction
+        self.action_names = demonstrations.action_names
         self.config = config
         self.episodes = [demonstrations.episode(index) for index in range(len(demonstrations))]
         self.check_dimensions(demonstrations)

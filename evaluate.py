@@ -400,38 +400,51 @@ def rollout_job(
 # ---- Without a simulator: held-out episodes ------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class ActionError:
+    """How far actions are from an expert's: mean absolute errors, of each number of an action."""
+
+    of_policy: np.ndarray  # (A,) of the actions that the policy draws, in the action's unit
+    of_mean_action: np.ndarray  # (A,) of always doing the mean action of what was trained on
+
+
 @torch.no_grad()
 def action_error(
     policy: DAMIPolicy,
     train_sampler: WindowSampler,
     heldout_sampler: WindowSampler,
     text: Tensor,
+    *,
+    demonstrations: WindowSampler | None = None,
+    zero_demonstration: bool = False,
     seed: int = 0,
-) -> tuple[float, float]:
-    """How far drawn actions are from an expert's: mean absolute error, in the action's unit.
+) -> ActionError:
+    """How far drawn actions are from an expert's on held-out episodes.
 
     Whole episodes are gone through as in a rollout, from one executed chunk of Ta actions to the
     next, but the policy sees the expert's frames, so that errors do not add up. The mean is over
-    the frames of all held-out episodes and the A numbers of an action.
+    the frames of all held-out episodes.
 
     Args:
         policy: in any mode.
-        train_sampler: of the episodes trained on; one of them is the reference demonstration.
+        train_sampler: of the episodes trained on.
         heldout_sampler: of the episodes to judge by.
         text: instruction feature, (text_dim,).
+        demonstrations: one of its episodes is the reference demonstration; None: `train_sampler`.
+        zero_demonstration: the policy reads zeros in place of its demonstration.
         seed: of reference demonstrations and noise.
-
-    Returns:
-        The error, and the error of always doing the mean action of `train_sampler`.
     """
+    demonstrations = demonstrations or train_sampler
     generator = torch.Generator().manual_seed(seed)
     device = text.device
     To, Ta = policy.config.n_obs_steps, policy.config.n_action_steps
     mean_action = train_sampler.action.mean(dim=0)  # (A,)
     errors, errors_of_mean = [], []
     for episode in heldout_sampler.episodes:
-        demonstration = train_sampler.demonstration(train_sampler.sample_episode(generator))
+        demonstration = demonstrations.demonstration(demonstrations.sample_episode(generator))
         demonstration = {name: x.to(device) for name, x in demonstration.items()}
+        if zero_demonstration:
+            demonstration = {name: torch.zeros_like(x) for name, x in demonstration.items()}
         context = policy.encode_demo(text[None], **demonstration)
 
         newest = torch.arange(episode.start, episode.stop, Ta)[:, None]  # (n, 1) frames
@@ -443,9 +456,12 @@ def action_error(
         executed = newest + torch.arange(Ta)  # (n, Ta) frames; the last may be behind the episode
         inside = executed < episode.stop
         expert = heldout_sampler.action[executed[inside]]  # (frames, A)
-        errors.append((drawn.to(expert.device)[inside] - expert).abs().flatten())
-        errors_of_mean.append((mean_action.to(expert.device) - expert).abs().flatten())
-    return torch.cat(errors).mean().item(), torch.cat(errors_of_mean).mean().item()
+        errors.append((drawn.to(expert.device)[inside] - expert).abs())
+        errors_of_mean.append((mean_action.to(expert.device) - expert).abs())
+    return ActionError(
+        of_policy=torch.cat(errors).mean(dim=0).cpu().numpy(),
+        of_mean_action=torch.cat(errors_of_mean).mean(dim=0).cpu().numpy(),
+    )
 
 
 def evaluate_heldout(
@@ -453,10 +469,24 @@ def evaluate_heldout(
     train_samplers: dict[str, WindowSampler],
     heldout_samplers: dict[str, WindowSampler],
     text: dict[str, Tensor],
-) -> dict[str, tuple[float, float]]:
-    """`action_error` of each task that has held-out episodes: (error, error of the mean action)."""
+    *,
+    zero_demonstration: bool = False,
+    swap_demonstrations: bool = False,
+) -> dict[str, ActionError]:
+    """`action_error` of each task that has held-out episodes.
+
+    With `swap_demonstrations` each task is given a demonstration of the next one.
+    """
+    demonstrations = of_next_task(train_samplers) if swap_demonstrations else train_samplers
     return {
-        task: action_error(policy, train_samplers[task], heldout_sampler, text[task])
+        task: action_error(
+            policy,
+            train_samplers[task],
+            heldout_sampler,
+            text[task],
+            demonstrations=demonstrations[task],
+            zero_demonstration=zero_demonstration,
+        )
         for task, heldout_sampler in heldout_samplers.items()
     }
 

@@ -183,16 +183,17 @@ def log_heldout_error(
     train_sampler: WindowSampler,
     heldout_sampler: WindowSampler,
     text: Tensor,
-) -> tuple[float, float]:
-    """Logs the action error on held-out episodes; returns it, and that of the mean action."""
-    error, of_mean_action = evaluate.action_error(policy, train_sampler, heldout_sampler, text)
+) -> evaluate.ActionError:
+    """Logs the action error on held-out episodes, and returns it."""
+    error = evaluate.action_error(policy, train_sampler, heldout_sampler, text)
+    mean = float(error.of_policy.mean())
     append_json(
         folder / "metrics.jsonl",
         step=step,
-        action_error=error,
-        action_errors={train_sampler.task: error},
+        action_error=mean,
+        action_errors={train_sampler.task: mean},
     )
-    return error, of_mean_action
+    return error
 
 
 def checkpoint_after(folder: Path, step: int) -> Path:
@@ -244,7 +245,7 @@ def adapt_checkpoint(
     write_text(folder / "metrics.jsonl", "")  # lines are appended
     if heldout is not None:
         heldout_sampler = WindowSampler(heldout, policy.config)
-        before, _ = log_heldout_error(folder, 0, policy, sampler, heldout_sampler, text)
+        before = log_heldout_error(folder, 0, policy, sampler, heldout_sampler, text)
     if settings.normalizer == "fit":
         policy.normalizer.fit([sampler])  # line 3
 
@@ -279,20 +280,17 @@ def adapt_checkpoint(
     model.save(folder / "adapted.pt", adapted, **checkpoint_info)
 
     if heldout is not None:
-        after, of_mean_action = log_heldout_error(
-            folder, settings.steps, adapted, sampler, heldout_sampler, text
-        )
-        table = report.heldout_table(
+        after = log_heldout_error(folder, settings.steps, adapted, sampler, heldout_sampler, text)
+        table = report.action_error_table(
             {
-                "step 0": {sampler.task: before},
-                f"step {settings.steps}": {sampler.task: after},
-                "the mean action": {sampler.task: of_mean_action},
-            }
+                "the mean action": before.of_mean_action,
+                "step 0": before.of_policy,
+                f"step {settings.steps}": after.of_policy,
+            },
+            sampler.action_names,
         )
         print(table, flush=True)
-        write_text(
-            folder / "held-out.md", f"{table}\n\nMean absolute error, in the action's unit.\n"
-        )
+        write_text(folder / "held-out.md", f"{table}\n\n{report.HELDOUT_NOTE}\n")
     written = {
         "checkpoint": str(checkpoint),
         "data": str(recording),

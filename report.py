@@ -161,6 +161,22 @@ def heldout_table(columns: dict[str, dict[str, float]]) -> str:
     return format_table(rows)
 
 
+def action_error_table(rows: dict[str, Sequence[float]], names: Sequence[str]) -> str:
+    """A Markdown table of action errors on held-out episodes: a column for each number, and all.
+
+    Args:
+        rows: title -> the errors of the numbers of an action, A of them.
+        names: what these numbers are called, A of them.
+    """
+    table = [["held-out action error", *names, "mean"]]
+    for title, errors in rows.items():
+        table.append([title, *(f"{error:.4f}" for error in (*errors, np.mean(errors)))])
+    return format_table(table)
+
+
+HELDOUT_NOTE = "Mean absolute error of each number of an action, in its own unit."
+
+
 def write_report(
     folder: Path,
     outcomes: dict[str, Outcomes],

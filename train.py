@@ -15,6 +15,7 @@ and tasks may be shared among processes without changing what they draw.
 """
 
 import argparse
+import copy
 import hashlib
 import json
 import math
@@ -59,7 +60,7 @@ from data import (
     load_demonstrations,
     write_text,
 )
-from maml import meta_gradient
+from maml import adapt, meta_gradient
 from model import TASK_INPUTS, CheckpointError, DAMIPolicy, PolicyConfig, ema_model, split
 from report import Outcomes
 from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
@@ -524,16 +525,17 @@ def log_heldout_errors(
     train_samplers: dict[str, WindowSampler],
     heldout_samplers: dict[str, WindowSampler],
     text: dict[str, Tensor],
+    settings: Settings,
 ) -> None:
     """Logs the average policy's action errors on held-out episodes, and writes held-out.md.
 
-    Its table has the errors of the first and of the last step at which they were measured, and
-    those of always doing the mean action.
+    One of its tables has the errors of each task, at the first and at the last step at which they
+    were measured; the other one those of each number of an action, as means over tasks. After the
+    last step of training it also has what the policy does of the task inputs and of inner steps.
     """
-    measured = evaluate.evaluate_heldout(
-        state.average.module, train_samplers, heldout_samplers, text
-    )
-    errors = {task: error for task, (error, _) in measured.items()}
+    policy = state.average.module
+    measured = evaluate.evaluate_heldout(policy, train_samplers, heldout_samplers, text)
+    errors = {task: float(error.of_policy.mean()) for task, error in measured.items()}
     append_json(
         folder / "metrics.jsonl",
         step=state.step,
@@ -542,9 +544,68 @@ def log_heldout_errors(
     )
     lines = [line for line in read_json_lines(folder / "metrics.jsonl") if "action_errors" in line]
     columns = {f"step {line['step']}": line["action_errors"] for line in (lines[0], lines[-1])}
-    columns["the mean action"] = {task: error for task, (_, error) in measured.items()}
-    table = report.heldout_table(columns)
-    write_text(folder / "held-out.md", f"{table}\n\nMean absolute error, in the action's unit.\n")
+    columns["the mean action"] = {
+        task: float(error.of_mean_action.mean()) for task, error in measured.items()
+    }
+    rows = {
+        "the mean action": np.mean([error.of_mean_action for error in measured.values()], axis=0),
+        f"step {state.step}": mean_of_tasks(measured),
+    }
+    if state.step == settings.steps:
+        rows.update(heldout_controls(policy, train_samplers, heldout_samplers, text, settings))
+    names = next(iter(train_samplers.values())).action_names
+    tables = [report.heldout_table(columns), report.action_error_table(rows, names)]
+    write_text(folder / "held-out.md", "\n\n".join([*tables, f"{report.HELDOUT_NOTE}\n"]))
+
+
+def mean_of_tasks(measured: dict[str, evaluate.ActionError]) -> np.ndarray:
+    """The policy's errors (A,), as a mean over tasks."""
+    return np.mean([error.of_policy for error in measured.values()], axis=0)
+
+
+def heldout_controls(
+    policy: DAMIPolicy,
+    train_samplers: dict[str, WindowSampler],
+    heldout_samplers: dict[str, WindowSampler],
+    text: dict[str, Tensor],
+    settings: Settings,
+) -> dict[str, np.ndarray]:
+    """Whether a policy reads its demonstration, and what an inner step does, where nothing can be
+    rolled out: title -> errors (A,) on held-out episodes, as means over tasks.
+    """
+    measure = partial(evaluate.evaluate_heldout, policy, train_samplers, heldout_samplers, text)
+    rows = {}
+    if policy.reads_demonstration and len(train_samplers) > 1:
+        rows["another task's demonstration"] = mean_of_tasks(measure(swap_demonstrations=True))
+    if policy.reads_demonstration:
+        rows["zeros for a demonstration"] = mean_of_tasks(measure(zero_demonstration=True))
+    if settings.maml == "off":
+        return rows
+
+    def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
+        return functional_call(policy, params, (), batch)
+
+    params = {name: p.detach() for name, p in policy.named_parameters()}
+    for steps in (1, 5):
+        measured = {}
+        for i, (task, heldout_sampler) in enumerate(heldout_samplers.items()):
+            support = task_batch(
+                policy,
+                train_samplers[task],
+                text[task],
+                n=settings.support,
+                seed=(settings.seed, settings.steps, i),  # a step that no training takes
+                settings=Settings(),  # no dropout
+            )
+            adapted = copy.deepcopy(policy)
+            adapted.load_state_dict(
+                adapt(loss_fn, params, support, settings.inner_lr, steps), strict=False
+            )
+            measured[task] = evaluate.action_error(
+                adapted, train_samplers[task], heldout_sampler, text[task]
+            )
+        rows[f"after {common.count(steps, 'inner step')}"] = mean_of_tasks(measured)
+    return rows
 
 
 def report_training(
@@ -861,7 +922,9 @@ def run(
                 if milestone:  # before last.pt: a run that goes on from there lacks none of it
                     save_average(folder, state, checkpoint_info)
                     if heldout_samplers:
-                        log_heldout_errors(folder, state, train_samplers, heldout_samplers, text)
+                        log_heldout_errors(
+                            folder, state, train_samplers, heldout_samplers, text, settings
+                        )
                     report.plot_curves(folder)
                 if milestone or stop.requested or saver.is_due():
                     saver.save(state)

@@ -888,7 +888,8 @@ def test_the_action_error_is_the_mean_absolute_error_over_executed_chunks(monkey
 
     monkeypatch.setattr(policy, "sample_actions", draw)
     monkeypatch.setattr(policy, "encode_demo", lambda text, demo_action, **_: demo_action)
-    error, error_of_mean = evaluate.action_error(
+    heldout.action[:, 3] += 1  # the numbers of an action have errors of their own
+    error = evaluate.action_error(
         policy,
         data.WindowSampler(kept, policy.config),
         data.WindowSampler(heldout, policy.config),
@@ -897,9 +898,9 @@ def test_the_action_error_is_the_mean_absolute_error_over_executed_chunks(monkey
     # Episode 1: chunks at 0, 8, 16, 24, 32; episode 2 has 12 frames: at 0, and half a one at 8.
     first, second = 10 + 0.01 * np.arange(40), 20 + 0.01 * np.arange(12)
     assert [len(chunks) for chunks in drawn] == [5, 2]
-    actions = np.concatenate([first, second])
-    assert error == pytest.approx(np.abs(actions - 10.5).mean(), rel=1e-4)
-    assert error_of_mean == pytest.approx(np.abs(actions - 0.01 * 14.5).mean(), rel=1e-4)
+    actions = np.concatenate([first, second])[:, None] + [0, 0, 0, 1]
+    assert error.of_policy == pytest.approx(np.abs(actions - 10.5).mean(0), rel=1e-4)
+    assert error.of_mean_action == pytest.approx(np.abs(actions - 0.01 * 14.5).mean(0), rel=1e-4)
     assert all((demo < 10).all() for demo in shown_to)  # an episode that was trained on
 
 
@@ -910,18 +911,24 @@ def test_every_task_with_held_out_episodes_is_judged_by_its_own(trained, recordi
         train_samplers[task] = data.WindowSampler(kept, TINY)
         heldout_samplers[task] = data.WindowSampler(heldout, TINY)
     text = dict(zip(TASKS, features(TASKS, None, None)[0]))
-    errors = evaluate.evaluate_heldout(trained, train_samplers, heldout_samplers, text)
-    assert errors == {
-        task: evaluate.action_error(
+
+    def errors(**options):
+        measured = evaluate.evaluate_heldout(
+            trained, train_samplers, heldout_samplers, text, **options
+        )
+        return {task: error.of_policy.tolist() for task, error in measured.items()}
+
+    own = errors()
+    for task in TASKS:
+        alone = evaluate.action_error(
             trained, train_samplers[task], heldout_samplers[task], text[task]
         )
-        for task in TASKS
-    }
-    first, second = errors.values()
-    assert first != second
+        assert own[task] == alone.of_policy.tolist()
+    assert own["touch-red"] != own["touch-green"]
+    swapped, without = errors(swap_demonstrations=True), errors(zero_demonstration=True)
+    assert own["touch-red"] != swapped["touch-red"] != without["touch-red"] != own["touch-red"]
     del heldout_samplers["touch-red"]
-    one = evaluate.evaluate_heldout(trained, train_samplers, heldout_samplers, text)
-    assert one == {"touch-green": second}
+    assert errors() == {"touch-green": own["touch-green"]}
 
 
 def test_a_policy_that_draws_the_experts_actions_has_no_action_error(recordings, monkeypatch):
@@ -938,8 +945,8 @@ def test_a_policy_that_draws_the_experts_actions_has_no_action_error(recordings,
         return torch.stack(chunks)
 
     monkeypatch.setattr(policy, "sample_actions", recall)
-    error, error_of_mean = evaluate.action_error(policy, sampler, sampler, torch.zeros(512))
-    assert error < 1e-6 < error_of_mean
+    error = evaluate.action_error(policy, sampler, sampler, torch.zeros(512))
+    assert error.of_policy.max() < 1e-6 < error.of_mean_action.mean()
 
 
 def test_checkpoints_are_judged_on_episodes_that_no_training_saw(
@@ -960,6 +967,7 @@ def test_checkpoints_are_judged_on_episodes_that_no_training_saw(
     for task, feature in zip(TASKS, text):
         shown = data.WindowSampler(data.load_demonstrations(f"seen/{task}.npz"), TINY)
         held = data.WindowSampler(data.load_demonstrations(folder / f"{task}.npz"), TINY)
-        errors.append(evaluate.action_error(trained, shown, held, feature))
+        error = evaluate.action_error(trained, shown, held, feature)
+        errors.append((error.of_policy.mean(), error.of_mean_action.mean()))
     expected = [f"{mean:.4f}" for mean in np.mean(errors, axis=0)]
     assert [cell.strip() for cell in rows[-1][1:]] == expected and rows[1] == rows[2] != rows[0]

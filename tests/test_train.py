@@ -758,6 +758,19 @@ def test_held_out_episodes_are_only_for_measuring(pair, capsys, monkeypatch):
     assert re.search(r"\| held-out action error +\| step 1 +\| step 2 +\| the mean action", table)
     for line in lines:
         assert f"{line['action_errors']['stir']:.4f}" in table
+    assert re.search(r"\| held-out action error +\| action\[0\] .* \| action\[3\] +\| mean", table)
+    rows = re.findall(r"^\| ([a-z][^|]*?) +\|", table.split("action[3]")[1], re.M)
+    assert rows == [
+        "the mean action",
+        "step 2",
+        "another task's demonstration",
+        "zeros for a demonstration",
+        "after 1 inner step",
+        "after 5 inner steps",
+    ]
+    errors = re.findall(r"\| ([0-9.]+) +\|$", table.split("action[3]")[1], re.M)
+    assert errors[1] == errors[2]  # both recordings hold the same episodes
+    assert len(errors) == 6 and len(set(errors)) == 5  # else another policy, or another input
     message = fails(train, [*argv, "--out", "runs/none", "--held-out", "2"], capsys)
     assert "has 2 episodes" in message
 

@@ -48,8 +48,9 @@ def main(argv: list[str] | None = None) -> None:
             {task: WindowSampler(unseen[task], policy.config) for task in tasks},
             texts[identity],
         )
-        means = np.mean(list(errors.values()), axis=0)  # of the policy, of the mean action
-        rows.append([str(path), *(f"{mean:.4f}" for mean in means)])
+        of_policy = np.mean([error.of_policy for error in errors.values()])
+        of_mean_action = np.mean([error.of_mean_action for error in errors.values()])
+        rows.append([str(path), f"{of_policy:.4f}", f"{of_mean_action:.4f}"])
     print(common.format_table(rows))
 
 
