@@ -5,11 +5,16 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import data
+import model
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"^```bash\n(.*?)^```", README, re.M | re.S)
+PYTHON_BLOCKS = re.findall(r"^```python\n(.*?)^```", README, re.M | re.S)
 LINES = [re.split(r"\s+# ", line)[0].strip() for block in BLOCKS for line in block.splitlines()]
 INLINE = re.findall(r"(?<!`)`((?:OMP_NUM_THREADS=\d+ )?(?:python|torchrun)\s[^`]+)`", README)
 COMMANDS = sorted({re.sub(r"\s+", " ", command) for command in LINES + INLINE if command})
@@ -34,6 +39,33 @@ def test_the_names_that_the_pages_mention_exist():
                 assert hasattr(owners[owner], name), f"{owner}.{name}"
                 mentioned.add(f"{owner}.{name}")
     assert {"model.split", "simulator.SIMULATORS", "DAMIPolicy.sample_actions"} <= mentioned
+
+
+def test_a_policy_is_used_from_python_as_the_readme_says(tmp_path, monkeypatch):
+    [script] = [block for block in PYTHON_BLOCKS if "sample_actions" in block]
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    recording = data.Demonstrations(
+        task="stir",
+        instruction="Stir the soup.",
+        points=rng.normal(size=(30, 64, 3)).astype(np.float16),
+        state=rng.normal(size=(30, 9)).astype(np.float32),
+        action=rng.normal(size=(30, 4)).astype(np.float32),
+        episode_ends=np.array([30]),
+        meta={},
+    )
+    data.save_demonstrations("recordings/stir.npz", recording)
+    Path("runs/finetune/stir-seed0").mkdir(parents=True)
+    policy = model.build_policy(model.PRESETS["tiny"])
+    info = {"suite": "own", "preset": "tiny", "arguments": {}, "step": 1}
+    info["text_weights"] = "random-seed-0"
+    model.save("runs/finetune/stir-seed0/adapted.pt", policy, **info)
+    observed = {
+        "last_two_clouds": rng.normal(size=(2, 300, 3)).astype(np.float32),
+        "last_two_states": rng.normal(size=(2, 9)).astype(np.float32),
+    }
+    exec(script, observed)
+    assert observed["actions"].shape == (8, 4)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
