@@ -328,6 +328,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--curve", nargs="+", type=int, default=[], help="roll out after these steps, too")
     add("--out", help="folder of the adapted policy (default: runs/finetune/TASK-seedSEED)")
     add("--overwrite", action="store_true", help="replace what is in that folder")
+    add("--resume", action="store_true", help="go on there, with the tasks not measured yet")
     evaluate.add_inference_flags(group)
     common.add_common_flags(group)
     rates = ", ".join(f"{part} {rate:g}" for part, rate in LEARNING_RATES.items())
@@ -390,6 +391,31 @@ def claim_folders(folders: Iterable[Path], checkpoint: Path, overwrite: bool) ->
     return old_files
 
 
+def read_measured(
+    folders: dict[str, Path], paths: dict[str, Path], checkpoint: Path, settings: Settings
+) -> dict[str, tuple[dict[str, Outcomes], float]]:
+    """What an interrupted run has measured: task -> (column -> outcomes, seconds of adapting).
+
+    `folders` and `paths` are task -> its folder and its recording. Raises UserError for a task that
+    was adapted to in another way than `settings`, or on something else.
+    """
+    measured = {}
+    for task, folder in folders.items():
+        if not (folder / "success.json").is_file() or not (folder / "config.json").is_file():
+            continue
+        config = json.loads((folder / "config.json").read_text())
+        seconds = config.pop("seconds")
+        now = {"checkpoint": str(checkpoint), "data": str(paths[task]), **asdict(settings)}
+        changed = [name for name, value in now.items() if config.get(name) != value]
+        if changed:
+            raise UserError(
+                f"{folder} was made with another {', '.join(changed)}: give the same as then, or "
+                "--overwrite it"
+            )
+        measured[task] = (report.read_outcomes(folder), seconds)
+    return measured
+
+
 def adapt_tasks(
     checkpoint: Path,
     paths: dict[str, Path],
@@ -401,8 +427,12 @@ def adapt_tasks(
     config_overrides: dict[str, Any],
     simulator: Simulator | None,
     workers: int | None,
+    provenance: dict[str, Any],
+    measured: dict[str, tuple[dict[str, Outcomes], float]],
 ) -> tuple[dict[str, Outcomes], float]:
     """Adapts a policy to each task separately; rolls it out before, in between and after.
+
+    What is measured of a task is written into its folder at once.
 
     Args:
         checkpoint: the policy.
@@ -410,6 +440,8 @@ def adapt_tasks(
         settings, curve, config_overrides: see `adapt_checkpoint`.
         simulator: to roll out in; None: there is none.
         workers: processes for the rollouts; None: one a core.
+        provenance: what stands beside the results.
+        measured: tasks that need no adaptation any more, see `read_measured`.
 
     Returns:
         Column ("before", "50 steps" ..., "after") -> how the episodes went, no columns without
@@ -418,43 +450,79 @@ def adapt_tasks(
     results: dict[str, Outcomes] = {}
     total_seconds = 0.0
     for task, folder in folders.items():
-        seconds = adapt_checkpoint(
-            checkpoint,
-            paths[task],
-            text[task],
-            folder,
-            settings,
-            curve=curve,
-            config_overrides=config_overrides,
-        )
-        total_seconds += seconds
-        print(f"adapted to {task} in {seconds:.1f} s; wrote {folder / 'adapted.pt'}", flush=True)
-        if simulator is None or settings.episodes == 0:
-            continue
-
-        columns = {"before": checkpoint}
-        for step in sorted(set(curve)):
-            columns[f"{step} steps"] = checkpoint_after(folder, step)
-        columns["after"] = folder / "adapted.pt"
-        kept = len(load_demonstrations(paths[task]).take(settings.demonstrations))
-        for column, policy in columns.items():
-            outcomes = evaluate.evaluate_checkpoint(
-                checkpoint=policy,
-                simulator=simulator,
-                recordings={task: paths[task]},
-                text={task: text[task]},
-                episodes=settings.episodes,
-                seed=settings.seed,
-                workers=workers,
-                device=text[task].device,
-                n_demonstrations=kept - settings.held_out,
+        if task in measured:
+            of_task, seconds = measured[task]
+            print(f"{task} was measured before: {folder}", flush=True)
+        else:
+            seconds = adapt_checkpoint(
+                checkpoint,
+                paths[task],
+                text[task],
+                folder,
+                settings,
+                curve=curve,
                 config_overrides=config_overrides,
-                description=f"evaluating {column}",
             )
+            written = folder / "adapted.pt"
+            print(f"adapted to {task} in {seconds:.1f} s; wrote {written}", flush=True)
+            of_task = {}
+            if simulator is not None and settings.episodes > 0:
+                of_task = roll_out_before_and_after(
+                    task,
+                    checkpoint,
+                    paths[task],
+                    text[task],
+                    folder,
+                    settings,
+                    curve=curve,
+                    config_overrides=config_overrides,
+                    simulator=simulator,
+                    workers=workers,
+                )
+                report.write_report(folder, of_task, {**provenance, "title": task})
+        total_seconds += seconds
+        for column, outcomes in of_task.items():
             of_column = results.setdefault(column, Outcomes({}, {}))
             of_column.any_step.update(outcomes.any_step)
             of_column.at_end.update(outcomes.at_end)
     return results, total_seconds
+
+
+def roll_out_before_and_after(
+    task: str,
+    checkpoint: Path,
+    recording: Path,
+    text: Tensor,
+    folder: Path,
+    settings: Settings,
+    *,
+    curve: Sequence[int],
+    config_overrides: dict[str, Any],
+    simulator: Simulator,
+    workers: int | None,
+) -> dict[str, Outcomes]:
+    """Rolls out a policy and what `adapt_checkpoint` made of it: column -> outcomes."""
+    columns = {"before": checkpoint}
+    for step in sorted(set(curve)):
+        columns[f"{step} steps"] = checkpoint_after(folder, step)
+    columns["after"] = folder / "adapted.pt"
+    kept = len(load_demonstrations(recording).take(settings.demonstrations))
+    return {
+        column: evaluate.evaluate_checkpoint(
+            checkpoint=policy,
+            simulator=simulator,
+            recordings={task: recording},
+            text={task: text},
+            episodes=settings.episodes,
+            seed=settings.seed,
+            workers=workers,
+            device=text.device,
+            n_demonstrations=kept - settings.held_out,
+            config_overrides=config_overrides,
+            description=f"evaluating {column}",
+        )
+        for column, policy in columns.items()
+    }
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -496,12 +564,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     folders = {task: out / task if several else out for task in tasks}
 
     with common.locked(out):
-        old_files = claim_folders({out, *folders.values()}, checkpoint, args.overwrite)
         if recording is None:
-            n = settings.demonstrations
-            paths = collect(simulator, tasks, args.data, episodes=n, workers=args.workers)
+            paths = {task: Path(args.data) / f"{task}.npz" for task in tasks}
         else:
             paths = {recording.task: file}
+        measured = {}
+        if args.resume and several:
+            measured = read_measured(folders, paths, checkpoint, settings)
+        unfinished = [folder for task, folder in folders.items() if task not in measured]
+        old_files = claim_folders({out, *unfinished}, checkpoint, args.overwrite or args.resume)
+        if recording is None:
+            n = settings.demonstrations
+            collect(simulator, tasks, args.data, episodes=n, workers=args.workers)
         instructions = read_instructions(paths, settings)
         text, text_weights = evaluate.instruction_features(
             instructions,
@@ -514,23 +588,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             old_file.unlink()
 
         common.print_settings(used=asdict(settings), default=asdict(Settings()))
-        results, seconds = adapt_tasks(
-            checkpoint,
-            paths,
-            text,
-            folders,
-            settings,
-            curve=args.curve,
-            config_overrides=config_overrides,
-            simulator=simulator,
-            workers=args.workers,
-        )
-        if not results:
-            return
         provenance = {
             "title": f"{name}: before and after {settings.steps} steps",
             "checkpoint": str(checkpoint),
-            "seconds a task": round(seconds / len(tasks), 1),
             "text weights": text_weights,
             "steps": settings.steps,
             "demonstrations": settings.demonstrations,
@@ -540,10 +600,29 @@ def main(argv: Sequence[str] | None = None) -> None:
             **common.provenance("finetune.py", argv, device),
             **config_overrides,
         }
+        try:
+            results, seconds = adapt_tasks(
+                checkpoint,
+                paths,
+                text,
+                folders,
+                settings,
+                curve=args.curve,
+                config_overrides=config_overrides,
+                simulator=simulator,
+                workers=args.workers,
+                provenance=provenance,
+                measured=measured,
+            )
+        except KeyboardInterrupt:
+            advice = "add --resume to go on with the tasks that are left" if several else ""
+            raise KeyboardInterrupt(advice) from None
+        if not results:
+            return
         table = report.write_report(
             out,
             results,
-            provenance,
+            {**provenance, "seconds a task": round(seconds / len(tasks), 1)},
             parts=evaluate.group_tasks(tasks, simulator, suite),
             paper=report.paper_columns(suite, [policy.config.policy]),
         )

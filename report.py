@@ -216,6 +216,16 @@ def write_report(
     return table
 
 
+def read_outcomes(folder: Path) -> dict[str, Outcomes]:
+    """The results that `write_report` wrote to a folder: label -> outcomes."""
+    written = json.loads((folder / "success.json").read_text())
+    at_end = written["successes at the end"]
+    return {
+        label: Outcomes(any_step, at_end.get(label))
+        for label, any_step in written["successes"].items()
+    }
+
+
 # ---- Charts --------------------------------------------------------------------------------------
 
 

@@ -211,6 +211,32 @@ def test_several_tasks_stand_side_by_side_in_one_report(run, recorded, monkeypat
     assert report["provenance"]["title"] == "door-close-reach: before and after 2 steps"
 
 
+def test_an_interrupted_run_of_several_tasks_goes_on_with_those_that_are_left(
+    run, recorded, monkeypatch, capsys
+):
+    evaluated(monkeypatch, lambda checkpoint: [checkpoint.stem == "adapted"])
+    argv = [*adapting(run, recorded, "--episodes 1", task="door-close reach"), "--out", "both"]
+    adapt_checkpoint = finetune.adapt_checkpoint
+
+    def interrupted(checkpoint, recording, *args, **options):
+        if recording.stem == "reach":
+            raise KeyboardInterrupt
+        return adapt_checkpoint(checkpoint, recording, *args, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(finetune, "adapt_checkpoint", interrupted)
+        with pytest.raises(KeyboardInterrupt, match="add --resume to go on"):
+            finetune.main(argv)
+    finished = fingerprint(Path("both/door-close"))
+    assert "add --overwrite" in fails(finetune, argv, capsys)
+    message = fails(finetune, [*argv, "--resume", "--batch", "3"], capsys)
+    assert "both/door-close was made with another batch: give the same" in message
+    finetune.main([*argv, "--resume"])
+    assert fingerprint(Path("both/door-close")) == finished
+    successes = json.loads(Path("both/success.json").read_text())["successes"]
+    assert successes["after"] == {"door-close": [True], "reach": [True]}
+
+
 def test_rollouts_read_the_demonstrations_that_were_adapted_to(run, recorded, monkeypatch):
     calls = evaluated(monkeypatch, lambda checkpoint: [True])
     argv = adapting(run, recorded / "reach.npz", "--episodes 1", task="reach")
