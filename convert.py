@@ -72,6 +72,18 @@ def refuse_damaged(path: Path, error: Exception, expected: str) -> NoReturn:
     refuse(path, f"is damaged or {expected}: {reason}; download it again")
 
 
+def readable(items: Iterator[Any], path: Path, expected: str) -> Iterator[Any]:
+    """What a library reads of a file, piece by piece; RecordingError where it cannot."""
+    while True:
+        try:
+            item = next(items)
+        except StopIteration:
+            return
+        except (OSError, ValueError) as error:  # those of pyarrow and PyAV are among them
+            refuse_damaged(path, error, expected)
+        yield item
+
+
 def package(name: str, path: Path) -> Any:
     """A package that is installed by who needs it."""
     try:
@@ -276,12 +288,15 @@ def pixels(path: Path, name: str, intrinsics: np.ndarray) -> list[float]:
     return numbers
 
 
+UNITS = {"m": 1.0, "mm": 0.001}  # metres
+
+
 def unit_in_metres(path: Path, name: str, stated: Any, camera: Camera) -> float:
     """The unit of depth: that of the camera, or what the source says; refused if neither does."""
     if camera.depth_scale is not None:
         return camera.depth_scale
-    scale = {"m": 1.0, "metre": 1.0, "meter": 1.0, "mm": 0.001}.get(stated, stated)
-    if type(scale) not in (int, float) or not scale > 0:
+    scale = UNITS.get(stated, stated) if isinstance(stated, str) else stated
+    if type(scale) not in (int, float) or not 0 < scale < math.inf:
         said = "nothing says" if stated is None else f"{stated!r} does not say"
         refuse(path, f"{said} in which unit {name} is: add --depth-unit mm, m, or metres a unit")
     return float(scale)
@@ -330,32 +345,8 @@ IN_ZARR = {
 
 def read_zarr(path: Path, options: Options) -> Source:
     """A replay buffer of DP3."""
-    zarr = package("zarr", path)
-    try:
-        if path.is_file():
-            group = zarr.open_group(
-                zarr.storage.ZipStore(path, mode="r"), mode="r", path=folder_in_zip(path)
-            )
-        else:
-            group = zarr.open_group(path, mode="r")
-        arrays = {part: group[name] for part, name in IN_ZARR.items() if name in group}
-    except Exception as error:  # zarr raises many types; each means it cannot be read
-        refuse_damaged(path, error, "neither zarr, HDF5 nor a dataset of LeRobot")
-    if missing := [name for part, name in IN_ZARR.items() if part not in arrays]:
-        refuse(path, f"it lacks {', '.join(missing)}: DP3 has {', '.join(IN_ZARR.values())}")
-    odd = [
-        IN_ZARR[p] for p, array in arrays.items() if getattr(array, "dtype", "O").kind not in "fiu"
-    ]
-    if odd:  # text or objects, which zarr might unpickle
-        refuse(path, f"{', '.join(odd)} must be plain numbers")
-    for part in ("points", "state"):  # zarr fills what is missing with zeros
-        there, all_chunks = arrays[part].nchunks_initialized, arrays[part].nchunks
-        if there < all_chunks:
-            refuse(
-                path,
-                f"{all_chunks - there} of {all_chunks} chunks of {IN_ZARR[part]} are missing or "
-                "hold nothing but zeros: download it again",
-            )
+    arrays, unread = open_zarr(path)
+    check_zarr(path, arrays)
     try:
         ends, state, action = (arrays[part][:] for part in ("ends", "state", "action"))
     except Exception as error:
@@ -368,30 +359,66 @@ def read_zarr(path: Path, options: Options) -> Source:
         refuse(path, f"lengths differ: {lengths}")
 
     def frames() -> Iterator[Frame]:
-        for episode, end in enumerate(ends.tolist()):
-            start = 0 if episode == 0 else int(ends[episode - 1])
-            for first in range(start, end, 64):  # not all clouds need fit into memory
-                try:
-                    clouds = arrays["points"][first : min(first + 64, end)]
-                except Exception as error:
-                    refuse_damaged(path, error, "no zarr")
-                for i, cloud in enumerate(clouds, start=first):
-                    yield Frame(
-                        episode=episode,
-                        index=i - start,
-                        time=None,
-                        task=0,
-                        instruction=None,
-                        state=state[i].ravel(),
-                        action=action[i].ravel(),
-                        cloud=partial(as_cloud, path, cloud),
-                    )
+        starts = [0, *ends.tolist()]
+        clouds = readable(zarr_rows(arrays["points"]), path, "no zarr")
+        for i, cloud in enumerate(clouds):
+            episode = int(np.searchsorted(ends, i, side="right"))
+            yield Frame(
+                episode=episode,
+                index=i - starts[episode],
+                time=None,
+                task=0,
+                instruction=None,
+                state=state[i].ravel(),
+                action=action[i].ravel(),
+                cloud=partial(as_cloud, path, cloud),
+            )
 
-    read = set(IN_ZARR.values())
-    other = [f"data/{name}" for name in group["data"] if f"data/{name}" not in read]
-    return Source(
-        frames=frames(), total_frames=lengths["meta/episode_ends"], unread=tuple(sorted(other))
-    )
+    return Source(frames=frames(), total_frames=lengths["meta/episode_ends"], unread=unread)
+
+
+def open_zarr(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The arrays of `IN_ZARR` that a folder or zip file has, and the names of others in data/."""
+    zarr = package("zarr", path)
+    try:
+        if path.is_dir():
+            group = zarr.open_group(path, mode="r")
+        else:
+            store = zarr.storage.ZipStore(path, mode="r")
+            group = zarr.open_group(store, mode="r", path=folder_in_zip(path))
+        arrays = {part: group[name] for part, name in IN_ZARR.items() if name in group}
+        stored = [f"data/{name}" for name in group["data"]] if "data" in group else []
+        return arrays, tuple(sorted(set(stored) - set(IN_ZARR.values())))
+    except Exception as error:  # zarr raises many types; each means it cannot be read
+        refuse_damaged(path, error, "neither zarr, HDF5 nor a dataset of LeRobot")
+
+
+def check_zarr(path: Path, arrays: dict[str, Any]) -> None:
+    """RecordingError where an array is missing, holds no numbers, or is not there as a whole."""
+    if missing := [name for part, name in IN_ZARR.items() if part not in arrays]:
+        refuse(path, f"it lacks {', '.join(missing)}: DP3 has {', '.join(IN_ZARR.values())}")
+    for part, array in arrays.items():
+        if getattr(array, "dtype", np.dtype("O")).kind not in "fiu":  # zarr may unpickle objects
+            refuse(path, f"{IN_ZARR[part]} must be plain numbers")
+    for part in ("points", "state"):  # zarr fills what is missing with zeros
+        chunks = arrays[part].nchunks
+        missing = chunks - arrays[part].nchunks_initialized
+        if missing > 0:
+            refuse(
+                path,
+                f"{missing} of {chunks} chunks of {IN_ZARR[part]} are missing or hold nothing but "
+                "zeros: download it again",
+            )
+
+
+def zarr_rows(array: Any) -> Iterator[np.ndarray]:
+    """The rows of an array, of which not all need fit into memory."""
+    for start in range(0, array.shape[0], 64):
+        try:
+            rows = array[start : start + 64]
+        except Exception as error:  # zarr and its codecs raise many types
+            raise OSError(error) from error
+        yield from rows
 
 
 def folder_in_zip(path: Path) -> str:
@@ -409,23 +436,38 @@ def folder_in_zip(path: Path) -> str:
 def read_lerobot(path: Path, options: Options) -> Source:
     """A dataset of LeRobot."""
     package("pyarrow.parquet", path)
-    info = read_json(path / "meta" / "info.json")
-    version, features = str(info.get("codebase_version")), info.get("features", {})
-    if version not in ("v2.0", "v2.1", "v3.0"):
-        refuse(path, f"is of LeRobot's format {version}: convert it to v3.0 with lerobot")
-    if missing := [name for name in ("observation.state", "action") if name not in features]:
-        refuse(path, f"it lacks {', '.join(missing)}; it holds {', '.join(features)}")
-    if type(info.get("fps")) not in (int, float, type(None)):
-        refuse(path, f"its fps is {info['fps']!r}, no number")
+    info = read_lerobot_info(path)
     dataset = LeRobot(path, info, options)
     return Source(
         frames=dataset.frames(),
         total_frames=info.get("total_frames"),
         total_episodes=info.get("total_episodes"),
-        lengths={e: int(row["length"]) for e, row in dataset.episodes.items() if "length" in row},
+        lengths={e: row["length"] for e, row in dataset.episodes.items() if row.get("length")},
         fps=info.get("fps"),
         unread=dataset.unread(),
     )
+
+
+def read_lerobot_info(path: Path) -> dict[str, Any]:
+    """meta/info.json; RecordingError where it is of another version, or of another form."""
+    info, file = read_json(path / "meta" / "info.json"), path / "meta" / "info.json"
+    version, features = str(info.get("codebase_version")), info.get("features", {})
+    if version not in ("v2.0", "v2.1", "v3.0"):
+        refuse(path, f"is of LeRobot's format {version}: convert it to v3.0 with lerobot")
+    if not isinstance(features, dict):
+        refuse(file, "its features must be an object")
+    for name, feature in features.items():
+        shape = feature.get("shape") if isinstance(feature, dict) else None
+        whole = isinstance(shape, list) and all(type(size) is int and size > 0 for size in shape)
+        if not whole or not isinstance(feature.get("dtype"), str):
+            refuse(file, f"{name} must have a dtype, and a shape of whole numbers")
+    if missing := [name for name in ("observation.state", "action") if name not in features]:
+        refuse(path, f"it lacks {', '.join(missing)}; it holds {', '.join(features)}")
+    for name in ("total_frames", "total_episodes", "chunks_size", "fps"):
+        kinds = (int, float) if name == "fps" else (int,)
+        if name in info and (type(info[name]) not in kinds or not info[name] > 0):
+            refuse(file, f"{name} is {info[name]!r}, no number above 0")
+    return info
 
 
 BOOKKEEPING = ("episode_index", "task_index", "frame_index", "timestamp", "index")
@@ -455,10 +497,8 @@ class LeRobot:
         self.color = self.intrinsics = None
         if self.is_depth:
             self.intrinsics = self.choose_intrinsics()
-            if not self.is_video(self.cloud):
-                stated = (self.features[self.cloud].get("info") or {}).get("depth_unit")
-                self.scale = unit_in_metres(path, self.cloud, stated, self.camera)
-            else:
+            self.scale = self.read_scale()
+            if self.is_video(self.cloud):
                 self.quantizer = self.read_quantizer()
             if options.color is not None:
                 self.color = self.choose_color(colored, options.color)
@@ -479,21 +519,36 @@ class LeRobot:
         return info if info.get("is_depth_map") or info.get("video.is_depth_map") else None
 
     def read_quantizer(self) -> dict[str, float]:
-        """How the codes of a depth video became of metres."""
+        """How metres became the codes of a depth video, see `dequantize`."""
         info = self.depth_info(self.cloud) or {}
         names = ("depth_min", "depth_max", "shift", "use_log")
-        if missing := [f"video.{name}" for name in names if f"video.{name}" not in info]:
+        quantizer = {name: info.get(f"video.{name}") for name in names}
+        missing = [n for n, value in quantizer.items() if type(value) not in (int, float, bool)]
+        if missing:
             refuse(
                 self.path / "meta" / "info.json",
-                f"does not say {', '.join(missing)} of {self.cloud}: its depth cannot be decoded",
+                f"does not say video.{', video.'.join(missing)} of {self.cloud}: its depth cannot "
+                "be decoded",
             )
-        quantizer = {name: float(info[f"video.{name}"]) for name in names}
-        shift = quantizer["shift"] if quantizer["use_log"] else math.inf
-        if not 0 <= quantizer["depth_min"] < quantizer["depth_max"] or (
-            quantizer["depth_min"] + shift <= 0
-        ):
+        nearest, farthest = quantizer["depth_min"], quantizer["depth_max"]
+        if quantizer["use_log"]:
+            nearest, farthest = nearest + quantizer["shift"], farthest + quantizer["shift"]
+        if not 0 <= nearest < farthest or (quantizer["use_log"] and nearest == 0):
             refuse(self.path, f"{self.cloud} has a range of depth that cannot be: {quantizer}")
         return quantizer
+
+    def read_scale(self) -> float:
+        """Metres a unit of the depth that is read.
+
+        A video is decoded to metres, by what lerobot took for the unit of the depth it was given.
+        If the camera's unit is said to be another one, all is as many times as far.
+        """
+        stated = (self.features[self.cloud].get("info") or {}).get("depth_unit")
+        if not self.is_video(self.cloud):
+            return unit_in_metres(self.path, self.cloud, stated, self.camera)
+        if self.camera.depth_scale is None:
+            return 1.0
+        return self.camera.depth_scale / unit_in_metres(self.path, self.cloud, stated, Camera())
 
     def choose_intrinsics(self) -> str | None:
         if self.camera.intrinsics is not None:
@@ -568,13 +623,9 @@ class LeRobot:
             names += [n for n in ("frame_index", "timestamp") if n in there]
             if missing := [n for n in names if n not in there]:
                 refuse(file, f"lacks {', '.join(missing)}")
-            try:  # depth of a whole dataset need not fit into memory
-                for batch in stored.iter_batches(64, columns=names):
-                    yield from self.frames_of(file, {n: self.values(file, batch, n) for n in names})
-            except (OSError, ValueError) as error:
-                if isinstance(error, RecordingError):
-                    raise
-                refuse_damaged(file, error, "no parquet file")
+            batches = stored.iter_batches(64, columns=names)  # not all depth fits into memory
+            for batch in readable(batches, file, "no parquet file"):
+                yield from self.frames_of(file, {n: self.values(file, batch, n) for n in names})
 
     def values(self, file: Path, batch: Any, name: str) -> Any:
         """A column of nested lists -> (frames, *shape), the shape that the dataset says."""
@@ -616,11 +667,11 @@ class LeRobot:
             return as_cloud(file, row[self.cloud])
         if self.is_video(self.cloud):
             codes = self.videos[self.cloud].at(episode, time, "gray12le")
-            depth, scale = dequantize(codes, **self.quantizer), 1.0
+            depth = dequantize(codes, **self.quantizer)
         elif self.is_picture(self.cloud):
-            depth, scale = decode_image(file, row[self.cloud], None), self.scale
+            depth = decode_image(file, row[self.cloud], None)
         else:
-            depth, scale = row[self.cloud], self.scale
+            depth = row[self.cloud]
         depth = image_size(file, self.cloud, depth)
         color = None
         if self.color is not None:
@@ -632,7 +683,7 @@ class LeRobot:
         intrinsics = self.camera.intrinsics
         if intrinsics is None:
             intrinsics = pixels(file, self.intrinsics, row[self.intrinsics])
-        return depth_cloud(depth, scale=scale, intrinsics=intrinsics, color=color)
+        return depth_cloud(depth, scale=self.scale, intrinsics=intrinsics, color=color)
 
 
 def natural(file: Path) -> list[int]:
@@ -684,19 +735,15 @@ class Video:
     def place(self, episode: int) -> tuple[Path, float]:
         """The file that an episode is in, and the second where it begins there."""
         info, row = self.dataset.info, self.dataset.episodes.get(episode, {})
-        template = info.get("video_path") or refuse(self.dataset.path, "meta/info.json: video_path")
         if info["codebase_version"] != "v3.0":
-            file = template.format(
-                episode_chunk=episode // info.get("chunks_size", 1000),
-                video_key=self.name,
-                episode_index=episode,
-            )
+            chunk = episode // info.get("chunks_size", 1000)
+            file = f"videos/chunk-{chunk:03d}/{self.name}/episode_{episode:06d}.mp4"
             return self.dataset.path / file, 0.0
         keys = [f"videos/{self.name}/{k}" for k in ("chunk_index", "file_index", "from_timestamp")]
         if missing := [key for key in keys if row.get(key) is None]:
             refuse(self.dataset.path, f"meta/episodes lacks {missing[0]} of episode {episode}")
         chunk, number, start = (row[key] for key in keys)
-        file = template.format(video_key=self.name, chunk_index=chunk, file_index=number)
+        file = f"videos/{self.name}/chunk-{chunk:03d}/file-{number:03d}.mp4"
         return self.dataset.path / file, float(start)
 
     def at(self, episode: int, time: float | None, pixel_format: str) -> np.ndarray:
@@ -717,16 +764,15 @@ class Video:
         if not file.is_file():
             refuse(file, "is missing: download it again")
         try:
-            with self.av.open(str(file)) as container:
-                for picture in container.decode(video=0):
-                    if pixel_format == "gray12le" and picture.format.components[0].bits != 12:
-                        refuse(file, f"is {picture.format.name}, not depth in 12 bits")
-                    seconds = float(picture.pts * picture.time_base)
-                    yield seconds, picture.to_ndarray(format=pixel_format)
-        except (OSError, ValueError) as error:  # those of PyAV are among them
-            if isinstance(error, RecordingError):
-                raise
+            container = self.av.open(str(file))
+        except (OSError, ValueError) as error:
             refuse_damaged(file, error, "no video")
+        with container:
+            for picture in readable(container.decode(video=0), file, "no video"):
+                if pixel_format == "gray12le" and picture.format.components[0].bits != 12:
+                    refuse(file, f"is {picture.format.name}, not depth in 12 bits")
+                seconds = float(picture.pts * picture.time_base)
+                yield seconds, picture.to_ndarray(format=pixel_format)
 
 
 # ---- HDF5 of robomimic and ManiSkill -------------------------------------------------------------
@@ -771,6 +817,7 @@ def read_hdf5(path: Path, options: Options) -> Source:
         attributes = first[name].attrs
         stated = attributes.get("depth_unit", attributes.get("unit", attributes.get("depth_scale")))
         stated = stated.item() if isinstance(stated, np.generic) else stated
+        stated = stated.decode(errors="replace") if isinstance(stated, bytes) else stated
         scale = unit_in_metres(path, name, stated, options.camera)
         intrinsics = hdf5_camera(path, name, "intrinsic", first, options.camera.intrinsics)
         extrinsics = hdf5_camera(path, name, "extrinsic_cv", first, options.camera.camera_to_base)
@@ -1166,7 +1213,7 @@ def read_options(args: argparse.Namespace) -> Options:
     camera = read_camera(Path(args.camera)) if args.camera else Camera()
     if args.depth_unit is not None:
         try:
-            scale = {"m": 1.0, "mm": 0.001}.get(args.depth_unit) or float(args.depth_unit)
+            scale = UNITS.get(args.depth_unit) or float(args.depth_unit)
             camera = replace(camera, depth_scale=scale)
         except ValueError:
             raise UserError(

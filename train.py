@@ -57,6 +57,7 @@ from data import (
     WindowSampler,
     hold_out,
     load_demonstrations,
+    suspicions,
     write_text,
 )
 from maml import meta_gradient
@@ -784,6 +785,9 @@ def run(
         task: load_demonstrations(path).take(settings.demonstrations)
         for task, path in paths.items()
     }
+    for task, recording in recordings.items() if rank == 0 else ():
+        for line in suspicions(recording):
+            print(f"{paths[task]}: {line}", flush=True)
     config = fit_to_recordings(
         config,
         list(recordings.values()),

@@ -210,8 +210,8 @@ def test_colors_are_kept_from_0_to_1(largest, capsys):
     assert capsys.readouterr().out.endswith("left out: nothing\n")
     found = load_demonstrations("recordings/stir-the-soup.npz").points
     stored = cloud / np.array([1, 1, 1, largest, largest, largest])
-    order = [np.lexsort(points[:, :3].T) for points in (found[9], stored[9])]
-    np.testing.assert_allclose(found[9][order[0]], stored[9][order[1]], atol=1e-3)
+    distance = np.linalg.norm(found[9][:, None, :3] - stored[9][None, :, :3], axis=-1)
+    np.testing.assert_allclose(found[9], stored[9][distance.argmin(axis=1)], atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -316,7 +316,6 @@ def dataset(path, version="v3.0", seen="observation.point_cloud", shape=(30, 3),
     features[seen]["info"] = info
     features["observation.images.top"] = {"dtype": "video", "shape": [3, 48, 64]}
     about = {"codebase_version": version, "total_frames": 20, "total_episodes": 3, "fps": 10}
-    about["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
     for folder in ("meta/episodes/chunk-000", "data/chunk-000"):
         (path / folder).mkdir(parents=True)
     (path / "meta/info.json").write_text(json.dumps(about | {"features": features}))
@@ -523,6 +522,8 @@ DATA, TASKS = "kitchen/data/chunk-000/file-000.parquet", "kitchen/meta/tasks.par
             "",
             "0.400 s lie between frame 4 and the next, where 10 frames a second are 0.100 s apart",
         ),
+        (lambda: edit(fps=lambda _: "10"), "", "info.json: fps is '10', no number above 0"),
+        (lambda: edit(features=lambda f: f | {"x": {"dtype": "x"}}), "", "info.json: x must have"),
         # Files that are not what their names say
         (write(DATA, LFS), "", "file-000.parquet: is a pointer of git-lfs"),
         (write(DATA, b"PAR1 and no more"), "", "file-000.parquet: is damaged or no parquet file"),
@@ -723,6 +724,14 @@ def test_a_depth_video_becomes_points():
     np.testing.assert_allclose(z, metres[8:13], atol=1.5e-3)
     z = load_demonstrations("recordings/stir-the-soup.npz").points[:, 0, 2]
     np.testing.assert_allclose(z, np.delete(metres, slice(8, 13)), atol=1.5e-3)
+
+
+def test_a_depth_video_of_a_camera_with_another_unit_is_as_many_times_as_far():
+    metres = depth_video()  # lerobot took what the camera gave for millimetres
+    argv = "--import kitchen --camera camera.json --num-points 1 --depth-unit 0.0001"
+    convert.main(argv.split())
+    z = load_demonstrations("recordings/pour-the-tea.npz").points[:, 0, 2]
+    np.testing.assert_allclose(z, metres[8:13] / 10, atol=2e-4)
 
 
 @pytest.mark.parametrize("use_log", [True, False])
