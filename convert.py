@@ -202,6 +202,7 @@ class Source:
 
 # ---- Clouds and depth ----------------------------------------------------------------------------
 
+LENS = "fx, fy, cx, cy"
 POINT_DIMS = range(3, 11)  # numbers a point may have
 SAMPLED_FROM = 8192  # points at most, since sampling takes time; of more, every k-th
 
@@ -560,9 +561,7 @@ class LeRobot:
                 f"has the intrinsics {', '.join(found)}: write those of {self.cloud} to --camera",
             )
         if not found:
-            refuse(
-                self.path, f"{self.cloud} needs the camera's fx, fy, cx, cy: write them to --camera"
-            )
+            refuse(self.path, f"{self.cloud} needs the camera's {LENS}: write them to --camera")
         return found[0]
 
     def choose_color(self, colored: set[str], chosen: str) -> str:
@@ -792,53 +791,21 @@ def read_hdf5(path: Path, options: Options) -> Source:
     except OSError as error:
         refuse_damaged(path, error, "no HDF5 file")
     parent = file["data"] if "data" in file else file
-    groups = {}
-    for name in parent:
-        if found := re.fullmatch(r"(?:demo|traj|episode)_(\d+)", name):
-            groups[int(found[1])] = parent[name]
+    numbers = {name: re.fullmatch(r"(?:demo|traj|episode)_(\d+)", name) for name in parent}
+    groups = {int(found[1]): parent[name] for name, found in numbers.items() if found}
     groups = dict(sorted(groups.items()))
     if not groups:
         refuse(path, f"holds no data/demo_0 or traj_0; it holds {', '.join(file)}")
     first = hdf5_arrays(next(iter(groups.values())))
     if "actions" not in first:
         refuse(path, f"it lacks actions; an episode holds {', '.join(first)}")
-    state = options.state or next((s for s in HDF5_STATES if set(s) <= set(first)), None)
-    if state is None or not set(state) <= set(first):
-        refuse(path, f"name the arrays of the state with --state; there are {', '.join(first)}")
-    shapes = {n: a.shape[1:] for n, a in first.items() if re.match("obs|observations", n)}
-    pictures = {n for n in shapes if re.search("rgb|image|color", n)}
-    candidates = {n: shape for n, shape in shapes.items() if n not in pictures}
-    name, is_depth = choose_array(path, candidates, set(), options.feature)
-    color = None
-    if options.color is not None:
-        color = hdf5_color(path, name, pictures, options.color)
-    intrinsics = extrinsics = scale = None
-    if is_depth:
-        attributes = first[name].attrs
-        stated = attributes.get("depth_unit", attributes.get("unit", attributes.get("depth_scale")))
-        stated = stated.item() if isinstance(stated, np.generic) else stated
-        stated = stated.decode(errors="replace") if isinstance(stated, bytes) else stated
-        scale = unit_in_metres(path, name, stated, options.camera)
-        intrinsics = hdf5_camera(path, name, "intrinsic", first, options.camera.intrinsics)
-        extrinsics = hdf5_camera(path, name, "extrinsic_cv", first, options.camera.camera_to_base)
-        if intrinsics is None and options.camera.intrinsics is None:
-            refuse(path, f"{name} needs the camera's fx, fy, cx, cy: write them to --camera")
-    look = partial(
-        hdf5_cloud,
-        path,
-        name=name,
-        color=color,
-        scale=scale,
-        intrinsics=intrinsics or options.camera.intrinsics,
-        extrinsics=extrinsics,
-    )
-    read = {"actions", name, color, intrinsics, extrinsics, *state}
-    longer = len(first[name]) == len(first["actions"]) + 1
+    data = HDF5(path, first, options)
+    longer = len(first[data.cloud]) == len(first["actions"]) + 1
     return Source(
-        frames=hdf5_frames(path, groups, state=state, look=look, instruction=libero(parent)),
+        frames=data.frames(groups, libero_instruction(parent)),
         total_frames=int(parent.attrs["total"]) if "total" in parent.attrs else None,
         lengths=hdf5_lengths(path, file, groups),
-        unread=tuple(n for n in first if n not in read),
+        unread=tuple(name for name in first if name not in data.read),
         left_out=("1 observation after each last action",) if longer else (),
     )
 
@@ -870,7 +837,7 @@ def hdf5_lengths(path: Path, file: Any, groups: dict[int, Any]) -> dict[int, int
     return lengths
 
 
-def libero(group: Any) -> str | None:
+def libero_instruction(group: Any) -> str | None:
     """The instruction that LIBERO's files hold; others have none."""
     try:
         return json.loads(group.attrs["problem_info"])["language_instruction"]
@@ -878,101 +845,130 @@ def libero(group: Any) -> str | None:
         return None
 
 
-def hdf5_color(path: Path, name: str, pictures: set[str], chosen: str) -> str:
-    """The color that stands beside a cloud or depth: in its folder, or by the name's beginning."""
-    folder, _, last = name.rpartition("/")
-    beginning = f"{folder}/{last.removesuffix('depth')}"
-    found = [n for n in sorted(pictures) if n.startswith(beginning)] or sorted(pictures)
-    if len([n for n in found if n.startswith(f"{folder}/")]) == 1:
-        found = [n for n in found if n.startswith(f"{folder}/")]
-    if chosen in pictures or (chosen == "" and len(found) == 1):
-        return chosen or found[0]
-    there = ", ".join(sorted(pictures)) or "none"
-    refuse(path, f"name the color of {name}, --color NAME; its pictures: {there}")
+class HDF5:
+    """Reads frames of demonstrations; which arrays, is decided by those of the first one."""
 
+    def __init__(self, path: Path, first: dict[str, Any], options: Options) -> None:
+        self.path, self.camera = path, options.camera
+        self.state = options.state or next((s for s in HDF5_STATES if set(s) <= set(first)), None)
+        if self.state is None or not set(self.state) <= set(first):
+            refuse(path, f"name the arrays of the state with --state; there are {', '.join(first)}")
 
-def hdf5_camera(path: Path, name: str, kind: str, arrays: dict, given: Any) -> str | None:
-    """The array of intrinsics or extrinsics of the camera of a depth image, if it has one."""
-    if given is not None:
+        observed = {name: array.shape[1:] for name, array in first.items() if name[:3] == "obs"}
+        pictures = {n for n in observed if re.search(r"(rgb|image|color)[^/]*$", n)}
+        pictures -= {n for n in pictures if re.search(r"(point|cloud|depth)[^/]*$", n)}
+        shapes = {name: shape for name, shape in observed.items() if name not in pictures}
+        self.cloud, self.is_depth = choose_array(path, shapes, set(), options.feature)
+
+        self.color = self.intrinsics = self.extrinsics = None
+        shape = observed[self.cloud]
+        has_color = not self.is_depth and shape[cloud_axis(shape)] >= 6  # in the points themselves
+        if options.color is not None and not has_color:
+            self.color = self.choose_color(pictures, options.color)
+        if self.is_depth:
+            self.scale = unit_in_metres(path, self.cloud, self.stated_unit(first), options.camera)
+            if self.camera.intrinsics is None:
+                self.intrinsics = self.choose_camera("intrinsic", first)
+            if self.camera.camera_to_base is None:
+                self.extrinsics = self.choose_camera("extrinsic_cv", first)
+            if self.intrinsics is None and self.camera.intrinsics is None:
+                refuse(path, f"{self.cloud} needs the camera's {LENS}: write them to --camera")
+        self.read = {"actions", *self.state, self.cloud, self.color}
+        self.read |= {self.intrinsics, self.extrinsics}
+
+    def stated_unit(self, first: dict[str, Any]) -> Any:
+        """The unit of depth, if an attribute of the array says it."""
+        attributes = first[self.cloud].attrs
+        for name in ("depth_unit", "unit", "depth_scale"):
+            if name in attributes:
+                unit = attributes[name]
+                unit = unit.item() if isinstance(unit, np.generic) else unit
+                return unit.decode(errors="replace") if isinstance(unit, bytes) else unit
         return None
-    found = [n for n in arrays if kind in n.rpartition("/")[2]]
-    camera = name.split("/")[-2]  # obs/sensor_data/CAMERA/depth, obs/sensor_param/CAMERA/...
-    own = [n for n in found if camera in n.split("/")]
-    if len(found) > 1 and len(own) != 1:
-        refuse(path, f"has {', '.join(found)}: write what belongs to {name} to --camera")
-    return (own or found or [None])[0]
 
+    def choose_color(self, pictures: set[str], chosen: str) -> str:
+        """The only picture, or the one that is named as the cloud or depth is."""
+        beginning = re.sub("(depth|xyzw?)$", "", self.cloud)
+        found = [n for n in pictures if n.startswith(beginning)] or list(pictures)
+        if chosen in pictures or (chosen == "" and len(found) == 1):
+            return chosen or found[0]
+        there = ", ".join(sorted(pictures)) or "none"
+        refuse(self.path, f"name the color of {self.cloud}, --color NAME; its pictures: {there}")
 
-def hdf5_frames(
-    path: Path, groups: dict[int, Any], *, state: list[str], look: Callable, instruction: Any
-) -> Iterator[Frame]:
-    """The frames of all episodes; an observation after the last action is left out."""
-    for episode, group in groups.items():
-        arrays = hdf5_arrays(group)
-        T = len(arrays["actions"]) if "actions" in arrays else 0
-        for name in state:
-            if name not in arrays or len(arrays[name]) not in (T, T + 1):
-                refuse(path, f"episode {episode} has {T} actions, but not as many of {name}")
-        try:
-            action = arrays["actions"][:].reshape(T, -1)
-            states = np.concatenate([arrays[n][:T].reshape(T, -1) for n in state], axis=1)
-        except OSError as error:
-            refuse_damaged(path, error, "no HDF5 file")
-        for i in range(T):
-            yield Frame(
-                episode=episode,
-                index=i,
-                time=None,
-                task=0,
-                instruction=instruction,
-                state=states[i],
-                action=action[i],
-                cloud=partial(look, arrays=arrays, episode=episode, i=i, T=T),
+    def choose_camera(self, kind: str, first: dict[str, Any]) -> str | None:
+        """The intrinsics or extrinsics of the camera of the depth, if there are any.
+
+        ManiSkill has obs/sensor_data/CAMERA/depth and obs/sensor_param/CAMERA/intrinsic_cv.
+        """
+        found = [name for name in first if kind in name.rpartition("/")[2]]
+        camera = self.cloud.split("/")[-2]
+        own = [name for name in found if camera in name.split("/")]
+        if len(found) > 1 and len(own) != 1:
+            refuse(
+                self.path, f"has {', '.join(found)}: write what belongs to {self.cloud} to --camera"
             )
+        return (own or found or [None])[0]
 
+    def frames(self, groups: dict[int, Any], instruction: str | None) -> Iterator[Frame]:
+        """The frames of all episodes; an observation after the last action is left out."""
+        for episode, group in groups.items():
+            arrays = hdf5_arrays(group)
+            T = len(arrays["actions"]) if "actions" in arrays else 0
+            for name in self.read - {None}:
+                if name not in arrays or len(arrays[name]) not in (T, T + 1):
+                    refuse(
+                        self.path, f"episode {episode} has {T} actions, but not as many of {name}"
+                    )
+            try:
+                action = arrays["actions"][:].reshape(T, -1)
+                parts = [arrays[name][:T].reshape(T, -1) for name in self.state]
+            except OSError as error:
+                refuse_damaged(self.path, error, "no HDF5 file")
+            state = np.concatenate(parts, axis=1)
+            for i in range(T):
+                yield Frame(
+                    episode=episode,
+                    index=i,
+                    time=None,
+                    task=0,
+                    instruction=instruction,
+                    state=state[i],
+                    action=action[i],
+                    cloud=partial(self.make_cloud, arrays, i),
+                )
 
-def hdf5_cloud(
-    path: Path,
-    *,
-    name: str,
-    color: str | None,
-    scale: float | None,
-    intrinsics: str | list | None,
-    extrinsics: str | None,
-    arrays: dict[str, Any],
-    episode: int,
-    i: int,
-    T: int,
-) -> np.ndarray:
-    """The cloud of frame i of an episode: as it is stored, or of its depth."""
-    row = {}
-    for n in (name, color, extrinsics, intrinsics if isinstance(intrinsics, str) else None):
-        if n is None:
-            continue
-        if n not in arrays or len(arrays[n]) not in (T, T + 1):
-            refuse(path, f"episode {episode} has {T} actions, but not as many of {n}")
+    def make_cloud(self, arrays: dict[str, Any], i: int) -> np.ndarray:
+        """The cloud of frame i of an episode: as it is stored, or of its depth."""
+        names = {self.cloud, self.color, self.intrinsics, self.extrinsics} - {None}
         try:
-            row[n] = arrays[n][i]
+            row = {name: arrays[name][i] for name in names}
         except OSError as error:
-            refuse_damaged(path, error, "no HDF5 file")
-    if scale is None:
-        points = as_cloud(path, row[name])
-        if name.endswith("xyzw"):  # homogeneous: w is 0 where nothing was seen
-            points = np.where(points[:, 3:4] > 0, points[:, :3], np.nan)
-        if color is None:
+            refuse_damaged(self.path, error, "no HDF5 file")
+        if not self.is_depth:
+            return self.colored_cloud(row)
+        depth = image_size(self.path, self.cloud, row[self.cloud])
+        color = pose = None
+        if self.color is not None:
+            color = color_image(self.path, self.color, row[self.color], depth)
+        if self.extrinsics is not None:  # from base to camera, (3, 4) or (4, 4)
+            pose = np.linalg.inv(np.vstack([row[self.extrinsics][:3], [0, 0, 0, 1]]))
+        intrinsics = self.camera.intrinsics
+        if intrinsics is None:
+            intrinsics = pixels(self.path, self.intrinsics, row[self.intrinsics])
+        return depth_cloud(depth, scale=self.scale, intrinsics=intrinsics, color=color, pose=pose)
+
+    def colored_cloud(self, row: dict[str, np.ndarray]) -> np.ndarray:
+        """A stored cloud, with the colors that stand beside it."""
+        points = as_cloud(self.path, row[self.cloud])
+        if self.cloud.endswith("xyzw"):  # homogeneous: w is 0 where nothing was seen
+            points = np.where(points[:, 3:] > 0, points[:, :3], np.float32(np.nan))
+        if self.color is None:
             return points
-        colors = row[color].reshape(-1, row[color].shape[-1])[:, :3]
-        if len(colors) != len(points):
-            refuse(path, f"{color} has {len(colors)} colors for {len(points)} points")
+        colors = row[self.color]
+        colors = colors.reshape(-1, colors.shape[-1])[:, :3]
+        if colors.shape != (len(points), 3):
+            refuse(self.path, f"{self.color} has {len(colors)} colors for {len(points)} points")
         return np.concatenate([points[:, :3], colors], axis=1).astype(np.float32)
-    depth = image_size(path, name, row[name])
-    if isinstance(intrinsics, str):
-        intrinsics = pixels(path, intrinsics, row[intrinsics])
-    pose = None
-    if extrinsics is not None:  # base -> camera, (3, 4) or (4, 4)
-        pose = np.linalg.inv(np.vstack([row[extrinsics][:3], [0, 0, 0, 1]]))
-    picture = None if color is None else color_image(path, color, row[color], depth)
-    return depth_cloud(depth, scale=scale, intrinsics=intrinsics, color=picture, pose=pose)
 
 
 # ---- The formats ---------------------------------------------------------------------------------

@@ -860,6 +860,45 @@ def test_depth_and_color_of_robomimic_become_colored_points():
     np.testing.assert_allclose(found[9, 0], [*seen_in_one_pixel(0.7), 0, 0.2, 1], rtol=2e-3)
 
 
+def test_colors_in_the_points_of_hdf5_are_kept(capsys):
+    cloud = RNG.uniform(0.1, 1, (12, 30, 6))
+    robomimic("demo.hdf5", **{"obs/pointcloud": lambda T: cloud[:T]})
+    convert.main(["--import", "demo.hdf5", *SAY, "--num-points", "30", "--color"])
+    found = load_demonstrations("recordings/stir-the-soup.npz").points
+    expected = {tuple(p) for p in np.float16(np.float32(cloud[3]))}
+    assert {tuple(p) for p in found[3]} == expected
+
+
+@pytest.mark.parametrize(
+    "unit, message", [("mm", None), (0.0001, None), (b"m", None), ("inch", "'inch' does not say")]
+)
+def test_the_unit_of_depth_may_be_an_attribute_of_it(unit, message, capsys):
+    metres = {"mm": 0.7, 0.0001: 0.07, b"m": 7}.get(unit)
+    stored = 7 if unit == b"m" else 700
+    robomimic("demo.hdf5", **{"obs/depth": lambda T: one_pixel(stored)[:T]})
+    with h5py.File("demo.hdf5", "a") as file:
+        del file["data/demo_9/obs/pointcloud"]
+        file["data/demo_9/obs/depth"].attrs["unit"] = unit
+    Path("camera.json").write_text(json.dumps({"intrinsics": LENS}))
+    argv = ["--import", "demo.hdf5", *SAY, "--camera", "camera.json"]
+    if message:
+        assert message in fails(convert, argv, capsys)
+        return
+    convert.main(argv)
+    found = load_demonstrations("recordings/stir-the-soup.npz").points
+    np.testing.assert_allclose(found[0, 0], seen_in_one_pixel(metres), rtol=3e-3)
+
+
+def test_the_instruction_of_libero_is_read():
+    robomimic("demo.hdf5")
+    with h5py.File("demo.hdf5", "a") as file:
+        said = json.dumps({"language_instruction": "open the drawer"})
+        file["data"].attrs["problem_info"] = said
+    convert.main(["--import", "demo.hdf5"])
+    found = load_demonstrations("recordings/open-the-drawer.npz")
+    assert found.instruction == "open the drawer"
+
+
 def maniskill(path, seen):
     """A trajectory as ManiSkill writes it: one observation more than actions."""
     T = 8
