@@ -832,7 +832,7 @@ def hdf5_lengths(path: Path, file: Any, groups: dict[int, Any]) -> dict[int, int
     beside = path.with_suffix(".json")
     if "data" not in file and beside.is_file():
         for row in read_json(beside).get("episodes", []):
-            if "elapsed_steps" in row:
+            if {"episode_id", "elapsed_steps"} <= set(row):
                 lengths[int(row["episode_id"])] = int(row["elapsed_steps"])
     return lengths
 
@@ -1037,9 +1037,11 @@ def assemble(
                 add_frame(path, episodes[-1], frame, options, num_points)
             previous = frame
 
+    if unknown := sorted(options.skip - set(lengths)):
+        refuse(path, f"has no episode {unknown[0]} to --skip")
     notes = list(source.left_out)
-    notes += [f"episode {number} (--skip)" for number in sorted(options.skip & set(lengths))]
-    if problem := wrong_totals(source, lengths):
+    notes += [f"episode {number} (--skip)" for number in sorted(options.skip)]
+    if problem := wrong_totals(source, lengths, options.skip):
         if not incomplete:
             refuse(path, f"{problem}: download it again, or import what there is by --incomplete")
         notes.append(f"what is missing ({problem})")
@@ -1048,7 +1050,7 @@ def assemble(
     if options.instruction and len({episode.task for episode in episodes}) > 1:
         refuse(path, "holds several tasks: leave --instruction out, each brings its own")
     if parts := len(episodes) - len({episode.number for episode in episodes}):
-        notes.append(f"nothing of episodes that do several tasks, cut {parts} times")
+        notes.append(f"{parts} changes of task within an episode, which is cut there")
     if source.unread:
         names = ", ".join(source.unread[:6]) + (", ..." if len(source.unread) > 6 else "")
         notes.append(f"{len(source.unread)} arrays ({names})")
@@ -1089,19 +1091,24 @@ def check_order(path: Path, frame: Frame, previous: Frame | None, fps: float | N
             )
 
 
-def wrong_totals(source: Source, lengths: Counter) -> str | None:
-    """How the frames that were read differ from what the source says about itself elsewhere."""
+def wrong_totals(source: Source, lengths: Counter, skip: frozenset[int]) -> str | None:
+    """How the frames that were read differ from what the source says about itself elsewhere.
+
+    Args:
+        lengths: episode -> frames that were read.
+        skip: episodes that may have any length.
+    """
     numbers = set(range(source.total_episodes or 0)) | set(source.lengths)
     if missing := sorted(numbers - set(lengths)):
         listed = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
         return f"of {len(numbers)} episodes {len(missing)} are missing ({listed})"
     for episode, length in source.lengths.items():
-        if lengths[episode] != length:
+        if lengths[episode] != length and episode not in skip:
             return f"episode {episode} should have {length} frames, but has {lengths[episode]}"
     total, episodes = sum(lengths.values()), len(lengths)
     if source.total_episodes not in (None, episodes):
         return f"it should have {source.total_episodes} episodes, but has {episodes}"
-    if source.total_frames not in (None, total):
+    if source.total_frames not in (None, total) and not skip:
         return f"it should have {source.total_frames} frames, but has {total}"
     return None
 
@@ -1154,7 +1161,7 @@ def fill_empty(path: Path, episode: Episode) -> None:
         )
     for i in empty:
         later = next(cloud for cloud in clouds[i:] + clouds[:i] if cloud is not None)
-        clouds[i] = clouds[i - 1] if i > 0 else later
+        clouds[i] = (clouds[i - 1] if i > 0 else later).copy()
     episode.left_out["empty clouds, in whose place stands the one before"] = len(empty)
 
 

@@ -233,9 +233,25 @@ def test_an_episode_can_be_left_out(capsys):
     message = fails(convert, ["--import", "stir.zarr", *SAY], capsys)
     assert "state of episode 0 holds NaN or infinity in frame 3: leave" in message
     convert.main(["--import", "stir.zarr", *SAY, *message.split("by ")[1].split()])
-    assert "left out: 36 numbers" not in capsys.readouterr().out
+    assert "episode 0 (--skip)" in capsys.readouterr().out
     found = load_demonstrations("recordings/stir-the-soup.npz")
     np.testing.assert_array_equal(found.action, arrays["data/action"][8:])
+
+
+def test_an_episode_to_be_left_out_must_be_there(capsys):
+    buffer("stir.zarr")
+    message = fails(convert, ["--import", "stir.zarr", *SAY, "--skip", "2"], capsys)
+    assert "stir.zarr: has no episode 2 to --skip" in message
+
+
+def test_the_colors_of_a_frame_that_stands_for_another_are_scaled_once():
+    cloud = RNG.uniform(1, 200, (20, 30, 6)).astype(np.float32)
+    cloud[..., :3] /= 200
+    cloud[7] = np.nan
+    buffer("stir.zarr", data__point_cloud=cloud)
+    convert.main(["--import", "stir.zarr", *SAY, "--color"])
+    points = load_demonstrations("recordings/stir-the-soup.npz").points
+    np.testing.assert_array_equal(points[7], points[6])
 
 
 def test_a_missing_chunk_is_not_read_as_zeros(capsys):
@@ -540,6 +556,22 @@ def test_a_wrong_dataset_is_refused_in_one_line(damage, options, message, capsys
     assert not Path("recordings").exists()
 
 
+@pytest.mark.parametrize(
+    "rows, message",
+    [
+        ([*range(3), *range(4, 20)], "episode 0: frame 4 where 3 belongs"),
+        (range(18), "episode 2 should have 7 frames, but has 5"),
+    ],
+)
+def test_what_is_advised_about_a_wrong_episode_leads_to_an_import(rows, message, capsys):
+    dataset("kitchen")
+    in_data(rows=rows)()
+    line = fails(convert, ["--import", "kitchen"], capsys)
+    assert message in line
+    convert.main(["--import", "kitchen", *line.split(" by ")[1].split()])
+    assert len(load_demonstrations("recordings/stir-the-soup.npz")) == 1 + ("incomplete" in line)
+
+
 def test_what_there_is_of_an_incomplete_dataset_is_imported_where_that_is_asked_for(capsys):
     dataset("kitchen")
     in_data(rows=range(13))()
@@ -553,7 +585,7 @@ def test_the_tasks_of_an_episode_that_does_several_become_episodes_of_their_own(
     values = dataset("kitchen")
     in_data(task_index=lambda t: [0] * 3 + [1] * 2 + [0] * 3 + t[8:])()
     convert.main("--import kitchen".split())
-    assert "nothing of episodes that do several tasks, cut 2 times" in capsys.readouterr().out
+    assert "left out: 2 changes of task within an episode" in capsys.readouterr().out
     found = load_demonstrations("recordings/stir-the-soup.npz")
     assert found.episode_ends.tolist() == [3, 6, 13]
     np.testing.assert_array_equal(found.state[3:6], values["observation.state"][5:8])
