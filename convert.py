@@ -443,7 +443,11 @@ def read_lerobot(path: Path, options: Options) -> Source:
         frames=dataset.frames(),
         total_frames=info.get("total_frames"),
         total_episodes=info.get("total_episodes"),
-        lengths={e: row["length"] for e, row in dataset.episodes.items() if row.get("length")},
+        lengths={
+            episode: row["length"]
+            for episode, row in dataset.episodes.items()
+            if type(row.get("length")) is int
+        },
         fps=info.get("fps"),
         unread=dataset.unread(),
     )
@@ -462,6 +466,8 @@ def read_lerobot_info(path: Path) -> dict[str, Any]:
         whole = isinstance(shape, list) and all(type(size) is int and size > 0 for size in shape)
         if not whole or not isinstance(feature.get("dtype"), str):
             refuse(file, f"{name} must have a dtype, and a shape of whole numbers")
+        if not all(isinstance(feature.get(k) or {}, dict) for k in ("info", "video_info")):
+            refuse(file, f"the info of {name} must be an object")
     if missing := [name for name in ("observation.state", "action") if name not in features]:
         refuse(path, f"it lacks {', '.join(missing)}; it holds {', '.join(features)}")
     for name in ("total_frames", "total_episodes", "chunks_size", "fps"):
@@ -592,7 +598,7 @@ class LeRobot:
             stored = self.open_parquet(file)
             columns = [n for n in stored.schema_arrow.names if not n.startswith("stats/")]
             rows += stored.read(columns=columns).to_pylist()
-        return {int(row["episode_index"]): row for row in rows if "episode_index" in row}
+        return {row["episode_index"]: row for row in rows if type(row.get("episode_index")) is int}
 
     def read_tasks(self) -> dict[int, Any]:
         """task_index -> instruction."""
@@ -607,7 +613,9 @@ class LeRobot:
         if (meta / "tasks.jsonl").exists():
             rows = read_json_lines(meta / "tasks.jsonl")
             return {
-                row["task_index"]: row["task"] for row in rows if {"task_index", "task"} <= {*row}
+                row["task_index"]: row.get("task")
+                for row in rows
+                if type(row.get("task_index")) is int
             }
         return {}
 
@@ -637,6 +645,8 @@ class LeRobot:
         values = column.to_numpy(zero_copy_only=False)
         if len(values) != len(batch) * math.prod(shape) or values.dtype.kind not in "fiu":
             refuse(file, f"{name} holds other than numbers of shape {shape}")
+        if name in BOOKKEEPING and not np.isfinite(values).all():
+            refuse(file, f"{name} is missing in some rows")
         return values.reshape(len(batch), *shape)
 
     def frames_of(self, file: Path, columns: dict[str, Any]) -> Iterator[Frame]:
@@ -790,9 +800,12 @@ def read_hdf5(path: Path, options: Options) -> Source:
         file = h5py.File(path, "r")
     except OSError as error:
         refuse_damaged(path, error, "no HDF5 file")
-    parent = file["data"] if "data" in file else file
-    numbers = {name: re.fullmatch(r"(?:demo|traj|episode)_(\d+)", name) for name in parent}
-    groups = {int(found[1]): parent[name] for name, found in numbers.items() if found}
+    parent = file["data"] if isinstance(file.get("data"), h5py.Group) else file
+    groups = {}
+    for name in parent:
+        number = re.fullmatch(r"(?:demo|traj|episode)_(\d+)", name)
+        if number and isinstance(parent.get(name), h5py.Group):
+            groups[int(number[1])] = parent[name]
     groups = dict(sorted(groups.items()))
     if not groups:
         refuse(path, f"holds no data/demo_0 or traj_0; it holds {', '.join(file)}")
@@ -803,8 +816,8 @@ def read_hdf5(path: Path, options: Options) -> Source:
     longer = len(first[data.cloud]) == len(first["actions"]) + 1
     return Source(
         frames=data.frames(groups, libero_instruction(parent)),
-        total_frames=int(parent.attrs["total"]) if "total" in parent.attrs else None,
-        lengths=hdf5_lengths(path, file, groups),
+        total_frames=hdf5_count(parent, "total"),
+        lengths=hdf5_lengths(path, groups),
         unread=tuple(name for name in first if name not in data.read),
         left_out=("1 observation after each last action",) if longer else (),
     )
@@ -822,18 +835,22 @@ def hdf5_arrays(group: Any) -> dict[str, Any]:
     return found
 
 
-def hdf5_lengths(path: Path, file: Any, groups: dict[int, Any]) -> dict[int, int]:
+def hdf5_count(group: Any, name: str) -> int | None:
+    """A whole number among the attributes of a group."""
+    value = np.asarray(group.attrs.get(name, np.nan))
+    return int(value) if value.shape == () and value.dtype.kind in "iu" else None
+
+
+def hdf5_lengths(path: Path, groups: dict[int, Any]) -> dict[int, int]:
     """episode -> frames, from attributes and from the JSON file beside those of ManiSkill."""
-    lengths = {
-        episode: int(group.attrs["num_samples"])
-        for episode, group in groups.items()
-        if "num_samples" in group.attrs
-    }
+    lengths = {episode: hdf5_count(group, "num_samples") for episode, group in groups.items()}
+    lengths = {episode: length for episode, length in lengths.items() if length is not None}
     beside = path.with_suffix(".json")
-    if "data" not in file and beside.is_file():
+    if not lengths and beside.is_file():
         for row in read_json(beside).get("episodes", []):
-            if {"episode_id", "elapsed_steps"} <= set(row):
-                lengths[int(row["episode_id"])] = int(row["elapsed_steps"])
+            numbers = row.get("episode_id"), row.get("elapsed_steps")
+            if all(type(number) is int for number in numbers):
+                lengths[numbers[0]] = numbers[1]
     return lengths
 
 

@@ -540,6 +540,8 @@ DATA, TASKS = "kitchen/data/chunk-000/file-000.parquet", "kitchen/meta/tasks.par
         ),
         (lambda: edit(fps=lambda _: "10"), "", "info.json: fps is '10', no number above 0"),
         (lambda: edit(features=lambda f: f | {"x": {"dtype": "x"}}), "", "info.json: x must have"),
+        (in_data(episode_index=lambda e: [None, *e[1:]]), "", "episode_index is missing in some"),
+        (in_data(action=lambda a: [None, *a[1:]]), "", "action holds other than numbers of shape"),
         # Files that are not what their names say
         (write(DATA, LFS), "", "file-000.parquet: is a pointer of git-lfs"),
         (write(DATA, b"PAR1 and no more"), "", "file-000.parquet: is damaged or no parquet file"),
@@ -990,6 +992,7 @@ def change_hdf5(change):
             SAY,
             "episode 9 should have 9 frames, but has 8",
         ),
+        (change_hdf5(lambda f: f.move("data", "other")), SAY, "holds no data/demo_0 or traj_0; it"),
         (lambda: None, [*SAY, "--state", "obs/pose"], "name the arrays of the state with --state"),
         (lambda: None, [*SAY, "--feature", "obs/depth"], "obs/depth is neither, a cloud (N, 3)"),
         (lambda: os.truncate("demo.hdf5", 3000), SAY, "demo.hdf5: is damaged or no HDF5 file"),

@@ -431,6 +431,12 @@ def test_a_good_recording_is_not_suspected(absolute):
     assert data.suspicions(recording((1,))) == []
 
 
+def test_recordings_of_meta_world_are_not_suspected(recorded):
+    files = sorted(recorded.glob("*.npz"))
+    assert len(files) == 4
+    assert not any(data.suspicions(data.load_demonstrations(file)) for file in files)
+
+
 def spiked(good):
     state = good.state.copy()
     state[100, 3] = 1e6
