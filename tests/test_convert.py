@@ -700,7 +700,7 @@ def encoded(image, kind):
 def write_video(path, pictures, *, codec, stored_as, given_as, options):
     """A video of ten frames a second."""
     av = pytest.importorskip("av")
-    path.parent.mkdir(parents=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=10, options=options)
         stream.width, stream.height, stream.pix_fmt = 64, 48, stored_as
@@ -723,41 +723,61 @@ def lerobots_codes(metres):
     return codes.clip(0, 4095).astype(np.uint16)
 
 
-def depth_video(info=DEPTH_INFO, stored_as="gray12le"):
-    """A dataset with a depth video: a pixel in an otherwise empty picture, a colour beside it."""
-    dataset("kitchen", depth=np.zeros((20, 48, 64)))
+SEEN, COLOR = "observation.images.depth", "observation.images.color"
+
+
+def write_videos(name, version, pictures, **encoding):
+    """Videos of the twenty frames: a file for all of them, or for each episode of the old format.
+
+    Returns what meta/episodes says of them.
+    """
+    if version == "v3.0":
+        write_video(Path(f"kitchen/videos/{name}/chunk-000/file-000.mp4"), pictures, **encoding)
+    else:
+        for episode, end in enumerate(np.cumsum(LENGTHS)):
+            file = f"kitchen/videos/chunk-000/{name}/episode_{episode:06d}.mp4"
+            write_video(Path(file), pictures[end - LENGTHS[episode] : end], **encoding)
+    place = {f"videos/{name}/{key}": [0] * 3 for key in ("chunk_index", "file_index")}
+    return place | {f"videos/{name}/from_timestamp": [0.0, 0.8, 1.3]}
+
+
+def depth_video(info=DEPTH_INFO, stored_as="gray12le", version="v3.0"):
+    """A dataset with a depth video, one pixel of which is not empty; returns that pixel's depth."""
+    dataset("kitchen", version, depth=np.zeros((20, 48, 64)))
     depth = np.zeros((20, 48, 64))
     depth[:, 10, 20] = 0.5 + np.arange(20) / 100
-    pictures = lerobots_codes(depth)
+    codes = lerobots_codes(depth)
     if stored_as != "gray12le":
-        pictures = (pictures >> 4).astype(np.uint8)
-    name = "observation.images.depth"
-    write_video(
-        Path(f"kitchen/videos/{name}/chunk-000/file-000.mp4"),
-        pictures,
-        codec="libx265",
-        stored_as=stored_as,
-        given_as=stored_as,
-        options={"x265-params": "lossless=1:log-level=none"},
-    )
-    place = {f"videos/{name}/{key}": [0] * 3 for key in ("chunk_index", "file_index")}
-    place[f"videos/{name}/from_timestamp"] = [0.0, 0.8, 1.3]
+        codes = (codes >> 4).astype(np.uint8)
+    lossless = {"x265-params": "lossless=1:log-level=none"}
+    encoding = {"codec": "libx265", "stored_as": stored_as, "options": lossless}
+    place = write_videos(SEEN, version, codes, given_as=stored_as, **encoding)
+    color = np.full((20, 48, 64, 3), [200, 100, 0], np.uint8)
+    encoding = {"codec": "libx264", "stored_as": "yuv420p", "options": {"crf": "1"}}
+    place |= write_videos(COLOR, version, color, given_as="rgb24", **encoding)
     table = {"episode_index": [0, 1, 2], "length": LENGTHS} | place
-    write_table(table, "kitchen/meta/episodes/chunk-000/file-000.parquet")
-    feature = {"dtype": "video", "shape": [48, 64, 1], "info": info}
-    edit(features=lambda old: {k: f for k, f in old.items() if "cloud" not in k} | {name: feature})
+    if version == "v3.0":
+        write_table(table, "kitchen/meta/episodes/chunk-000/file-000.parquet")
+    features = {
+        SEEN: {"dtype": "video", "shape": [48, 64, 1], "info": info},
+        COLOR: {"dtype": "video", "shape": [48, 64, 3], "info": {"is_depth_map": False}},
+    }
+    edit(features=lambda old: {k: f for k, f in old.items() if "cloud" not in k} | features)
     without("depth")()
     Path("camera.json").write_text(json.dumps({"intrinsics": [40.0, 50.0, 32.0, 24.0]}))
     return depth[:, 10, 20]
 
 
-def test_a_depth_video_becomes_points():
-    metres = depth_video()
-    convert.main("--import kitchen --camera camera.json --num-points 1".split())
-    z = load_demonstrations("recordings/pour-the-tea.npz").points[:, 0, 2]
-    np.testing.assert_allclose(z, metres[8:13], atol=1.5e-3)
-    z = load_demonstrations("recordings/stir-the-soup.npz").points[:, 0, 2]
-    np.testing.assert_allclose(z, np.delete(metres, slice(8, 13)), atol=1.5e-3)
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_depth_and_color_of_videos_become_colored_points(version):
+    metres = depth_video(version=version)
+    argv = f"--import kitchen --camera camera.json --num-points 1 --color {COLOR}".split()
+    convert.main(argv)
+    pour = load_demonstrations("recordings/pour-the-tea.npz").points[:, 0]
+    stir = load_demonstrations("recordings/stir-the-soup.npz").points[:, 0]
+    np.testing.assert_allclose(pour[:, 2], metres[8:13], atol=1.5e-3)
+    np.testing.assert_allclose(stir[:, 2], np.delete(metres, slice(8, 13)), atol=1.5e-3)
+    np.testing.assert_allclose(stir[:, 3:], np.tile([200 / 255, 100 / 255, 0], (15, 1)), atol=0.02)
 
 
 def test_a_depth_video_of_a_camera_with_another_unit_is_as_many_times_as_far():
