@@ -194,10 +194,17 @@ class Demonstrations:
         """All numbers are finite, and far from the largest of float32."""
         for name in ("points", "state", "action"):
             array = getattr(self, name)
-            if not np.isfinite(array).all() or float(np.abs(array).max()) >= 1e30:
-                raise RecordingError(
-                    f"{name} holds NaN, infinite or huge numbers: record it again, in metres"
-                )
+            if np.isfinite(array).all() and float(np.abs(array).max()) < 1e30:
+                continue
+            usable = np.isfinite(array) & (np.abs(array) < 1e30)
+            frames = np.flatnonzero(~usable.reshape(len(array), -1).all(axis=1))
+            advice = "record it again, in metres"
+            if name == "points":
+                advice = "leave such points out of a cloud before it is sampled"
+            raise RecordingError(
+                f"{name} holds NaN, infinite or huge numbers in {len(frames)} of {len(array)} "
+                f"frames, first in frame {frames[0]}: {advice}"
+            )
 
     def check_points(self) -> None:
         """Positions are metres, features are small, and something was seen in every frame."""

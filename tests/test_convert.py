@@ -10,6 +10,8 @@ import sys
 from fractions import Fraction
 from pathlib import Path
 
+import av
+import h5py
 import numpy as np
 import PIL.Image
 import pyarrow
@@ -699,7 +701,6 @@ def encoded(image, kind):
 
 def write_video(path, pictures, *, codec, stored_as, given_as, options):
     """A video of ten frames a second."""
-    av = pytest.importorskip("av")
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=10, options=options)
@@ -860,8 +861,6 @@ def test_depth_and_color_of_pictures_become_colored_points(capsys):
 
 
 # ---- HDF5 ----------------------------------------------------------------------------------------
-
-h5py = pytest.importorskip("h5py")
 
 
 def robomimic(path, seen="pointcloud", **changes):

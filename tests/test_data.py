@@ -326,10 +326,10 @@ def meta(**changes):
 # What replaces parts of a good file of two episodes, 20 and 10 frames, and what is said of it.
 BAD_PARTS = [
     ({"action": None}, "lacks action"),
-    ({"points": NAN}, "points holds NaN"),
+    ({"points": NAN}, "points holds NaN, .* in 30 of 30 frames, first in frame 0: leave such poi"),
     ({"state": np.full((30, 9), np.inf, np.float32)}, "state holds NaN"),
     ({"points": NAN[..., :2]}, "points must be"),
-    ({"points": with_feature(np.nan)}, "points holds NaN"),
+    ({"points": with_feature(np.nan)}, "points holds NaN, .* in 1 of 30 frames, first in frame 29"),
     ({"points": with_feature(255)}, "features of points reach 255: .* write colours from 0 to 1"),
     ({"points": with_feature(-2)}, "features of points reach 2"),
     ({"points": with_empty_cloud(np.zeros((30, 16, 3)))}, "all points of frame 0 are at 0, 0, 0"),
