@@ -196,7 +196,7 @@ class Demonstrations:
             array = getattr(self, name)
             if np.isfinite(array).all() and float(np.abs(array).max()) < 1e30:
                 continue
-            usable = np.isfinite(array) & (np.abs(array) < 1e30)
+            usable = np.isfinite(array) & (np.abs(array.astype(np.float64)) < 1e30)
             frames = np.flatnonzero(~usable.reshape(len(array), -1).all(axis=1))
             advice = "record it again, in metres"
             if name == "points":
