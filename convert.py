@@ -459,6 +459,18 @@ def read_lerobot_info(path: Path) -> dict[str, Any]:
     version, features = str(info.get("codebase_version")), info.get("features", {})
     if version not in ("v2.0", "v2.1", "v3.0"):
         refuse(path, f"is of LeRobot's format {version}: convert it to v3.0 with lerobot")
+    check_features(file, features)
+    if missing := [name for name in ("observation.state", "action") if name not in features]:
+        refuse(path, f"it lacks {', '.join(missing)}; it holds {', '.join(features)}")
+    for name in ("total_frames", "total_episodes", "chunks_size", "fps"):
+        kinds = (int, float) if name == "fps" else (int,)
+        if name in info and (type(info[name]) not in kinds or not info[name] > 0):
+            refuse(file, f"{name} is {info[name]!r}, no number above 0")
+    return info
+
+
+def check_features(file: Path, features: Any) -> None:
+    """RecordingError unless all features say their dtype, shape and, if at all, more in objects."""
     if not isinstance(features, dict):
         refuse(file, "its features must be an object")
     for name, feature in features.items():
@@ -468,13 +480,6 @@ def read_lerobot_info(path: Path) -> dict[str, Any]:
             refuse(file, f"{name} must have a dtype, and a shape of whole numbers")
         if not all(isinstance(feature.get(k) or {}, dict) for k in ("info", "video_info")):
             refuse(file, f"the info of {name} must be an object")
-    if missing := [name for name in ("observation.state", "action") if name not in features]:
-        refuse(path, f"it lacks {', '.join(missing)}; it holds {', '.join(features)}")
-    for name in ("total_frames", "total_episodes", "chunks_size", "fps"):
-        kinds = (int, float) if name == "fps" else (int,)
-        if name in info and (type(info[name]) not in kinds or not info[name] > 0):
-            refuse(file, f"{name} is {info[name]!r}, no number above 0")
-    return info
 
 
 BOOKKEEPING = ("episode_index", "task_index", "frame_index", "timestamp", "index")
@@ -1024,7 +1029,7 @@ class Episode:
 
     number: int  # what the source calls it
     task: int
-    instruction: Any
+    instruction: str
     clouds: list[np.ndarray | None] = field(default_factory=list)  # None: nothing was seen
     states: list[np.ndarray] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)
@@ -1039,6 +1044,37 @@ def assemble(
     Returns the episodes of each instruction, in the order of the source, and what is left out of
     all of them. Raises RecordingError where the source contradicts itself or lacks something.
     """
+    episodes, lengths = read_episodes(path, source, options, num_points)
+    notes = list(source.left_out)
+    if unknown := sorted(options.skip - set(lengths)):
+        refuse(path, f"has no episode {unknown[0]} to --skip")
+    notes += [f"episode {number} (--skip)" for number in sorted(options.skip)]
+    if problem := wrong_totals(source, lengths, options.skip):
+        if not incomplete:
+            refuse(path, f"{problem}: download it again, or import what there is by --incomplete")
+        notes.append(f"what is missing ({problem})")
+    if not episodes:
+        refuse(path, "holds no frames: record or download it again")
+    if parts := len(episodes) - len({episode.number for episode in episodes}):
+        notes.append(f"{parts} changes of task within an episode, which is cut there")
+    if source.unread:
+        names = ", ".join(source.unread[:6]) + (", ..." if len(source.unread) > 6 else "")
+        notes.append(f"{len(source.unread)} arrays ({names})")
+
+    for episode in episodes:
+        fill_empty(path, episode)
+    if options.color is not None:
+        scale_colors(path, episodes)
+    tasks: dict[str, list[Episode]] = {}
+    for episode in episodes:
+        tasks.setdefault(episode.instruction, []).append(episode)
+    return tasks, notes
+
+
+def read_episodes(
+    path: Path, source: Source, options: Options, num_points: int
+) -> tuple[list[Episode], Counter]:
+    """The episodes of a source that are not left out, and how many frames each of its own has."""
     episodes: list[Episode] = []
     lengths: Counter = Counter()  # episode -> frames
     previous = None
@@ -1050,39 +1086,22 @@ def assemble(
             if frame.episode not in options.skip:
                 check_order(path, frame, None if first else previous, source.fps)
                 if first or frame.task != previous.task:
-                    episodes.append(Episode(frame.episode, frame.task, frame.instruction))
+                    instruction = choose_instruction(path, frame, options.instruction)
+                    episodes.append(Episode(frame.episode, frame.task, instruction))
+                    if options.instruction and frame.task != episodes[0].task:
+                        refuse(path, "holds several tasks: leave --instruction out")
                 add_frame(path, episodes[-1], frame, options, num_points)
             previous = frame
+    return episodes, lengths
 
-    if unknown := sorted(options.skip - set(lengths)):
-        refuse(path, f"has no episode {unknown[0]} to --skip")
-    notes = list(source.left_out)
-    notes += [f"episode {number} (--skip)" for number in sorted(options.skip)]
-    if problem := wrong_totals(source, lengths, options.skip):
-        if not incomplete:
-            refuse(path, f"{problem}: download it again, or import what there is by --incomplete")
-        notes.append(f"what is missing ({problem})")
-    if not episodes:
-        refuse(path, "holds no frames: record or download it again")
-    if options.instruction and len({episode.task for episode in episodes}) > 1:
-        refuse(path, "holds several tasks: leave --instruction out, each brings its own")
-    if parts := len(episodes) - len({episode.number for episode in episodes}):
-        notes.append(f"{parts} changes of task within an episode, which is cut there")
-    if source.unread:
-        names = ", ".join(source.unread[:6]) + (", ..." if len(source.unread) > 6 else "")
-        notes.append(f"{len(source.unread)} arrays ({names})")
 
-    tasks: dict[str, list[Episode]] = {}
-    for episode in episodes:
-        fill_empty(path, episode)
-        said = options.instruction or episode.instruction
-        if not isinstance(said, str) or not said.strip():
-            problem = "does not say" if said is None else f"says by {said!r}, which is no text,"
-            refuse(path, f'it {problem} what is done: add --instruction "Stir the soup."')
-        tasks.setdefault(said, []).append(episode)
-    if options.color is not None:
-        scale_colors(path, episodes)
-    return tasks, notes
+def choose_instruction(path: Path, frame: Frame, given: str | None) -> str:
+    """What is done: the instruction that is given, or else what the source says."""
+    said = given or frame.instruction
+    if isinstance(said, str) and said.strip():
+        return said
+    problem = "does not say" if said is None else f"says by {said!r}, which is no text,"
+    refuse(path, f'it {problem} what is done: add --instruction "Stir the soup."')
 
 
 def check_order(path: Path, frame: Frame, previous: Frame | None, fps: float | None) -> None:
