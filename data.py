@@ -1,4 +1,4 @@
-"""Demonstrations: their files, the windows that are trained on, and augmentation.
+"""Demonstrations: their files, what looks wrong in them, windows that are trained on, augmentation.
 
 Nothing here knows a simulator or a robot: simulator.py and robot.py record, and so may you. A file
 is checked when it is written and when it is read. `WindowSampler` holds a recording as tensors, and
@@ -14,6 +14,7 @@ import json
 import math
 import os
 import re
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -78,7 +79,9 @@ class Demonstrations:
 
     - positions_in_state: k, where the first 3 k numbers of a state are k positions x, y, z in the
       frame of the points, and the first three of an action are a change of the first position.
-      Only such scenes can be augmented.
+      A pose of seven numbers that begins with x, y, z has 1; joint angles have 0. Only such scenes
+      can be augmented: points, positions and displacement turn by up to 10 degrees together, while
+      an orientation in the state or the action stays as it is, and so is wrong by that much.
     - success_frames: the frame of each episode's first success, counted from the episode's start.
     - workspace: two opposite corners of the box that holds the points, metres.
     - simulator: the name of the simulator that they were made in; own recordings have none.
@@ -92,6 +95,23 @@ class Demonstrations:
     action: np.ndarray  # (F, A) float32
     episode_ends: np.ndarray  # (E,) int64: one past the last frame of each episode
     meta: dict
+
+    def __post_init__(self) -> None:
+        """Raises RecordingError for a field of another type, which no method could work with."""
+        for name in ("task", "instruction"):
+            value = getattr(self, name)
+            if not isinstance(value, str):
+                raise RecordingError(f"{name} must be text (str), not {type(value).__name__}")
+        for name in ("points", "state", "action", "episode_ends"):
+            value = getattr(self, name)
+            if not isinstance(value, np.ndarray):
+                raise RecordingError(
+                    f"{name} must be a NumPy array, not {type(value).__name__}: use np.array"
+                )
+        if not isinstance(self.meta, dict):
+            raise RecordingError(
+                f"meta must be a dict, not {type(self.meta).__name__}: {{}} says nothing"
+            )
 
     def __len__(self) -> int:
         return len(self.episode_ends)
@@ -139,11 +159,7 @@ class Demonstrations:
         self.check_meta()
 
     def check_text(self) -> None:
-        """Task and instruction are text, and files can be named by the task."""
-        for name in ("task", "instruction"):
-            value = getattr(self, name)
-            if not isinstance(value, str):
-                raise RecordingError(f"{name} must be text (str), not {type(value).__name__}")
+        """Files can be named by the task."""
         if not re.fullmatch(NAME, self.task):
             raise RecordingError(
                 f"task {self.task[:100]!r} is no name of letters, digits, '-', '_' and '.'"
@@ -151,10 +167,6 @@ class Demonstrations:
 
     def check_shapes(self) -> None:
         """The fields that are arrays have the number of dimensions and the dtypes they need."""
-        for name in ("points", "state", "action", "episode_ends"):
-            value = getattr(self, name)
-            if not isinstance(value, np.ndarray):
-                raise RecordingError(f"{name} must be a NumPy array, not {type(value).__name__}")
         for name, dims in (("points", 3), ("state", 2), ("action", 2)):
             array = getattr(self, name)
             if array.ndim != dims or array.dtype not in FLOATS or 0 in array.shape[1:]:
@@ -189,10 +201,17 @@ class Demonstrations:
         """All numbers are finite, and far from the largest of float32."""
         for name in ("points", "state", "action"):
             array = getattr(self, name)
-            if not np.isfinite(array).all() or float(np.abs(array).max()) >= 1e30:
-                raise RecordingError(
-                    f"{name} holds NaN, infinite or huge numbers: record it again, in metres"
-                )
+            if np.isfinite(array).all() and float(np.abs(array).max()) < 1e30:
+                continue
+            usable = np.isfinite(array) & (np.abs(array.astype(np.float64)) < 1e30)
+            frames = np.flatnonzero(~usable.reshape(len(array), -1).all(axis=1))
+            advice = "record it again, in metres"
+            if name == "points":
+                advice = "leave such points out of a cloud before it is sampled"
+            raise RecordingError(
+                f"{name} holds NaN, infinite or huge numbers in {len(frames)} of {len(array)} "
+                f"frames, first in frame {frames[0]}: {advice}"
+            )
 
     def check_points(self) -> None:
         """Positions are metres, features are small, and something was seen in every frame."""
@@ -214,39 +233,37 @@ class Demonstrations:
 
     def check_meta(self) -> None:
         """What `meta` says can be written as JSON, and its known entries make sense."""
-        if not isinstance(self.meta, dict):
-            raise RecordingError(f"meta must be a dict, not {type(self.meta).__name__}")
-        try:
-            json.dumps(self.meta)
-        except (TypeError, ValueError) as error:
-            raise RecordingError(
-                f"meta must hold what JSON can (of NumPy, write x.item() or x.tolist()): {error}"
-            ) from None
-        self.check_positions_in_state()
-        self.check_success_frames()
-        self.check_workspace()
-        if "simulator" in self.meta and not isinstance(self.meta["simulator"], str):
-            raise RecordingError(f"simulator must be a name, not {self.meta['simulator']!r}")
-        names, action_dim = self.action_names, self.action.shape[1]
+        meta = {}  # as a file gives it back
+        for name, value in self.meta.items():
+            try:
+                meta[name] = json.loads(meta_as_json(value))
+            except (TypeError, ValueError) as error:
+                raise RecordingError(f"meta must hold what JSON can, {name}: {error}") from None
+        self.check_positions_in_state(meta)
+        self.check_success_frames(meta)
+        self.check_workspace(meta)
+        if "simulator" in meta and not isinstance(meta["simulator"], str):
+            raise RecordingError(f"simulator must be a name, not {meta['simulator']!r}")
+        names = meta.get("action_names", self.action_names)
+        action_dim = self.action.shape[1]
         if not isinstance(names, list) or [type(name) for name in names] != [str] * action_dim:
-            raise RecordingError(
-                f"action_names must be a list of {action_dim} names, not {names!r}"
-            )
+            raise RecordingError(f"action_names must be {action_dim} names, not {names!r}")
 
-    def check_positions_in_state(self) -> None:
-        count = self.meta.get("positions_in_state", 0)
+    def check_positions_in_state(self, meta: dict) -> None:
+        count = meta.get("positions_in_state", 0)
         state_dim = self.state.shape[1]
         if type(count) is not int or not 0 <= 3 * count <= state_dim:
             raise RecordingError(
-                f"positions_in_state is {count!r}, a state has {state_dim} numbers"
+                f"positions_in_state is {count!r}, a state has {state_dim} numbers: write how many "
+                "points x, y, z it begins with, a whole number"
             )
         if count and self.action.shape[1] < 3:
             raise RecordingError("with positions_in_state an action must begin with a displacement")
 
-    def check_success_frames(self) -> None:
-        if "success_frames" not in self.meta:
+    def check_success_frames(self, meta: dict) -> None:
+        if "success_frames" not in meta:
             return
-        frames = self.meta["success_frames"]
+        frames = meta["success_frames"]
         if (
             not isinstance(frames, list)
             or len(frames) < len(self)  # `take` keeps the entries of episodes that it drops
@@ -256,15 +273,26 @@ class Demonstrations:
                 "success_frames must be a list with one whole number for each episode"
             )
 
-    def check_workspace(self) -> None:
-        if self.meta.get("workspace") is None:
+    def check_workspace(self, meta: dict) -> None:
+        if meta.get("workspace") is None:
             return
         try:
-            corners = np.array(self.meta["workspace"], np.float64)
+            corners = np.array(meta["workspace"], np.float64)
         except (TypeError, ValueError):  # no numbers, or lists of different lengths
             corners = np.zeros(0)
         if corners.shape != (2, 3) or not np.isfinite(corners).all():
             raise RecordingError("workspace must be two corners of three numbers, metres")
+
+
+def meta_as_json(value: Any) -> str:
+    """JSON text of `meta` or an entry; numbers and arrays of NumPy become numbers and lists."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, (np.generic, np.ndarray)):
+            return value.tolist()
+        raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+
+    return json.dumps(value, default=plain)
 
 
 def hold_out(
@@ -305,14 +333,18 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
     """Writes a file whole or not at all.
 
     `write` is called with a path of the same name in a new hidden folder beside `path`; then that
-    file takes the place of `path`. If `write` raises, the old file stays as it is. Only a process
-    that is killed leaves the hidden folder behind; no other process ever removes it.
+    file takes the place of `path`, with the mode of the old one. If `path` is a symbolic link, the
+    file that it points to is replaced. If `write` raises, the old file stays as it is. Only a
+    process that is killed leaves the hidden folder behind; no other process ever removes it.
     """
     path = Path(path)
-    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
+    target = path.resolve()  # differs where `path` is a link
+    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=target.parent) as folder:
         temporary = Path(folder) / path.name
         write(temporary)
-        os.replace(temporary, path)
+        if target.exists():
+            shutil.copymode(target, temporary)
+        os.replace(temporary, target)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -337,7 +369,7 @@ def save_demonstrations(path: str | Path, demonstrations: Demonstrations) -> Non
                 state=demonstrations.state,
                 action=demonstrations.action,
                 episode_ends=demonstrations.episode_ends,
-                meta=json.dumps(demonstrations.meta),
+                meta=meta_as_json(demonstrations.meta),
             )
 
     Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -367,6 +399,9 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     if missing := [name for name in FIELDS if name not in arrays]:
         raise RecordingError(f"{path} is no file of demonstrations: it lacks {', '.join(missing)}")
 
+    meta = read_json(path, "meta", arrays["meta"])
+    if not isinstance(meta, dict):
+        raise RecordingError(f"{path}: meta must be a dict, not {type(meta).__name__}")
     demonstrations = Demonstrations(
         task=read_text(path, "task", arrays["task"]),
         instruction=read_text(path, "instruction", arrays["instruction"]),
@@ -374,7 +409,7 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
         state=arrays["state"],
         action=arrays["action"],
         episode_ends=arrays["episode_ends"],
-        meta=read_json(path, "meta", arrays["meta"]),
+        meta=meta,
     )
     check_file(path, demonstrations)
     return demonstrations
@@ -401,6 +436,149 @@ def read_json(path: Path, name: str, array: np.ndarray) -> Any:
         return json.loads(read_text(path, name, array))
     except (json.JSONDecodeError, RecursionError) as error:
         raise RecordingError(f"{path}: {name} is no JSON: {error}") from None
+
+
+# ---- Suspicions ----------------------------------------------------------------------------------
+
+SPREADS = 20  # a number that lies so many times the usual spread outside of it is an outlier
+SCENE = (0.05, 10.0)  # metres: the diagonal of what a manipulator works on
+LAGS = range(-2, 3)  # frames by which actions may be shifted
+
+
+def suspicions(demonstrations: Demonstrations) -> list[str]:
+    """What looks like a mistake of the recorder, though it could be trained on; one line each.
+
+    Errors are not among them: those are raised by `Demonstrations.check`. A good recording has no
+    suspicions, but not every mistake can be seen: a controller that follows its actions several
+    frames later, such as Meta-World's, hides actions that are stored one frame late.
+    """
+    return [
+        *suspect_outliers("state", demonstrations),
+        *suspect_outliers("action", demonstrations),
+        *suspect_scale(demonstrations),
+        *suspect_shifted_actions(demonstrations),
+        *suspect_episode_ends(demonstrations),
+    ]
+
+
+def suspect_outliers(name: str, demonstrations: Demonstrations) -> list[str]:
+    """Single numbers of `state` or `action` that stretch the range that training scales by."""
+    values = getattr(demonstrations, name).astype(np.float64)  # (F, D)
+    low = np.percentile(values, 1, axis=0, method="higher")  # never the smallest number itself
+    high = np.percentile(values, 99, axis=0, method="lower")
+    outside = np.maximum(values - high, low - values)  # (F, D)
+    lines = []
+    for d in np.flatnonzero((high > low) & (outside.max(axis=0) > SPREADS * (high - low))):
+        frame = int(outside[:, d].argmax())
+        episode = int(np.searchsorted(demonstrations.episode_ends, frame, side="right"))
+        lines.append(
+            f"{name} {d} is {values[frame, d]:.6g} in frame {frame} (episode {episode}), while 98 "
+            f"percent of the frames lie from {low[d]:.4g} to {high[d]:.4g}: training scales by the "
+            "whole range, and everything else would come close to one value"
+        )
+    return lines
+
+
+def suspect_scale(demonstrations: Demonstrations) -> list[str]:
+    """Clouds that are no scene in metres, and positions in the state that are far from them."""
+    frames = np.linspace(0, len(demonstrations.points) - 1, 100).round().astype(int)
+    frames = np.unique(frames)
+    xyz = positions(demonstrations.points[frames]).astype(np.float64)  # (f, N, 3)
+    low, high = np.percentile(xyz, [1, 99], axis=(0, 1))  # (3,) and (3,)
+    size = float(np.linalg.norm(high - low))
+    if not SCENE[0] <= size <= SCENE[1]:
+        return [
+            f"the points span {size:.3g} m: are they in metres, and only those of the workspace?"
+        ]
+
+    count = int(demonstrations.meta.get("positions_in_state", 0))
+    in_state = demonstrations.state[frames, : 3 * count].reshape(len(frames), count, 3)
+    outside = np.maximum(np.maximum(low - in_state, in_state - high), 0)  # (f, positions, 3)
+    distance = np.linalg.norm(outside, axis=-1)  # (f, positions), 0 inside of the points' box
+    far = np.flatnonzero(np.median(distance, axis=0) > size)
+    if len(far) == 0:
+        return []
+    middle = np.argsort(distance[:, far[0]])[len(frames) // 2]  # the frame of the median
+    x, y, z = in_state[middle, far[0]]
+    return [
+        f"position {', '.join(map(str, far))} of the state lies far from the points, which span "
+        f"{size:.3g} m ({x:.4g}, {y:.4g}, {z:.4g} in frame {frames[middle]}): is it in metres, and "
+        "in the frame of the points?"
+    ]
+
+
+def suspect_shifted_actions(demonstrations: Demonstrations) -> list[str]:
+    """Actions that go with the state's change at another frame better than at their own.
+
+    Action i is compared with the change of state i that follows it; so is its own change, which is
+    what corresponds to it where actions are target positions. Nothing moves before it is told to,
+    so a negative lag is a mistake. A positive one may be that of the controller, which spreads over
+    several frames: only one that is nearly perfect is suspected.
+    """
+    margin, actions, changes = max(LAGS), [], {lag: [] for lag in LAGS}
+    dims = min(demonstrations.state.shape[1], demonstrations.action.shape[1])
+    for index in range(len(demonstrations)):
+        frames = demonstrations.episode(index)
+        action = demonstrations.action[frames, :dims].astype(np.float64)  # (T, D)
+        change = np.diff(demonstrations.state[frames, :dims].astype(np.float64), axis=0)
+        inner = np.arange(margin, len(change) - margin)
+        actions.append(np.stack([action[inner], action[inner] - action[inner - 1]]))  # (2, t, D)
+        for lag in LAGS:
+            changes[lag].append(change[inner + lag])  # (t, D)
+    acted = np.concatenate(actions, axis=1)
+    if acted.shape[1] < 8:
+        return []
+
+    curves = np.stack([correlation(acted, np.concatenate(changes[lag])) for lag in LAGS])
+    kind = curves.max(axis=0).argmax(axis=0)  # (D,) actions, or their own changes
+    curves = curves[:, kind, np.arange(dims)]  # (lags, D)
+    related = curves.max(axis=0) > 0.9
+    if not related.any():
+        return []
+    curve = curves[:, related].mean(axis=1)  # (lags,)
+    best, own = int(curve.argmax()), LAGS.index(0)
+    lag, unexplained = LAGS[best], (1 - curve[own]) / max(1 - curve[best], 1e-9)
+    if curve[best] - curve[own] < 0.005 or unexplained < (2 if lag < 0 else 10):
+        return []
+    return [
+        f"actions go best with the change of the state {abs(lag)} "
+        f"{'frame earlier' if lag < 0 else 'frame later'} (correlation {curve[best]:.3f}, with the "
+        f"change that follows them {curve[own]:.3f}): an action is what is done after its frame"
+    ]
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Correlation coefficients of a (..., t, D) and b (t, D) over time; 0 where one is constant."""
+    a, b = a - a.mean(axis=-2, keepdims=True), b - b.mean(axis=-2, keepdims=True)
+    scale = np.sqrt((a * a).sum(axis=-2) * (b * b).sum(axis=-2))
+    return np.divide((a * b).sum(axis=-2), scale, out=np.zeros_like(scale), where=scale > 1e-12)
+
+
+def suspect_episode_ends(demonstrations: Demonstrations) -> list[str]:
+    """Episodes at whose end the state goes on smoothly, but jumps one or two frames beside it."""
+    state = demonstrations.state.astype(np.float64)
+    spread = np.ptp(state, axis=0)
+    state = state[:, spread > 0] / spread[spread > 0]
+    step = np.linalg.norm(np.diff(state, axis=0), axis=1)  # (F - 1,) from frame i to i + 1
+    if len(step) == 0:
+        return []
+    usual = np.percentile(step, 90, method="lower")
+    ends = demonstrations.episode_ends[:-1] - 1  # the last frames, but for that of the recording
+    found = []  # frame that is jumped from, episode, how far that is from its end
+    for episode, end in enumerate(ends.tolist()):
+        for offset in (-1, 1, -2, 2):
+            frame = end + offset
+            inside = 0 <= frame < len(step) and frame not in ends
+            if inside and step[frame] > 5 * max(usual, step[end]):
+                found.append((frame, episode, offset))
+    if not found:
+        return []
+    frame, episode, offset = found[0]
+    return [
+        f"the state jumps from frame {frame} to {frame + 1}, but not from {frame - offset} to "
+        f"{frame - offset + 1}, where episode {episode} ends ({len(found)} such ends in all): is "
+        f"episode_ends {abs(offset)} too {'large' if offset < 0 else 'small'}?"
+    ]
 
 
 # ---- Augmentation --------------------------------------------------------------------------------

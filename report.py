@@ -319,10 +319,11 @@ def save_png(figure: Any, path: str | Path, dpi: int) -> None:
 def plot_demonstration(
     demonstrations: Demonstrations, path: str | Path, episode: int = 0, columns: int = 6
 ) -> None:
-    """Writes a picture of one episode: its clouds along time, colored by height, and its actions.
+    """Writes a picture of one episode: its clouds along time, and its actions.
 
-    Positions in the state (hand and fingers) are red dots. The boxes `workspace` and `tcp_box` are
-    drawn where the recording's meta has them. Points with features are drawn by their positions.
+    Points have their own color where three features follow their position, none below 0, and else
+    that of their height. Positions in the state (hand and fingers) are red dots. The boxes
+    `workspace` and `tcp_box` are drawn where the recording's meta has them.
 
     Args:
         demonstrations: a recording.
@@ -335,6 +336,8 @@ def plot_demonstration(
     frames = demonstrations.episode(episode)
     meta = demonstrations.meta
     clouds = positions(demonstrations.points[frames]).astype(np.float32)  # (T, N, 3)
+    features = demonstrations.points[frames, :, 3:].astype(np.float32)  # (T, N, P - 3)
+    have_color = features.shape[2] == 3 and features.min() >= 0
     n_positions = meta.get("positions_in_state", 0)
     state_positions = demonstrations.state[frames, : 3 * n_positions]
     state_positions = state_positions.reshape(len(clouds), n_positions, 3)  # (T, positions, 3)
@@ -356,8 +359,11 @@ def plot_demonstration(
     picked_frames = np.linspace(0, len(clouds) - 1, columns).round().astype(int)
     for column, t in enumerate(picked_frames):
         axes = figure.add_subplot(grid[0, column], projection="3d", computed_zorder=False)
-        height = clouds[t, :, 2]
-        axes.scatter(*clouds[t].T, c=height, vmin=low[2], vmax=high[2], cmap="viridis", s=2)
+        if have_color:
+            axes.scatter(*clouds[t].T, c=features[t], s=2)
+        else:
+            height = clouds[t, :, 2]
+            axes.scatter(*clouds[t].T, c=height, vmin=low[2], vmax=high[2], cmap="viridis", s=2)
         axes.scatter(*state_positions[t].T, c="red", s=14)
         plot_box(axes, boxes.get("workspace"), color="black")
         plot_box(axes, boxes.get("tcp_box"), color="red")

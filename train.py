@@ -58,6 +58,7 @@ from data import (
     WindowSampler,
     hold_out,
     load_demonstrations,
+    suspicions,
     write_text,
 )
 from maml import adapt, meta_gradient
@@ -852,6 +853,9 @@ def run(
         task: load_demonstrations(path).take(settings.demonstrations)
         for task, path in paths.items()
     }
+    for task, recording in recordings.items() if rank == 0 else ():
+        for line in suspicions(recording):
+            print(f"{paths[task]}: {line}", flush=True)
     config = fit_to_recordings(
         config,
         list(recordings.values()),

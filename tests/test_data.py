@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import stat
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -242,17 +243,9 @@ def test_a_temporary_file_keeps_its_suffix_and_is_on_the_same_disk(tmp_path):
 
 UNSAVABLE = [
     ({"points": np.full((30, 16, 3), np.nan, np.float16)}, "points holds NaN"),
-    ({"task": b"reach"}, "task must be text .* not bytes"),
-    ({"instruction": b"Move."}, "instruction must be text .* not bytes"),
-    ({"instruction": None}, "instruction must be text .* not NoneType"),
-    ({"instruction": ["Move."]}, "instruction must be text .* not list"),
-    ({"state": [[0.0] * 9] * 30}, "state must be a NumPy array, not list"),
-    ({"action": torch.zeros(30, 4)}, "action must be a NumPy array, not Tensor"),
-    ({"episode_ends": [20, 30]}, "episode_ends must be a NumPy array, not list"),
-    ({"meta": None}, "meta must be a dict, not NoneType"),
-    ({"meta": {"positions_in_state": np.int64(1)}}, r"write x\.item\(\) .*int64"),
-    ({"meta": {"success_frames": np.array([1, 2])}}, r"or x\.tolist\(\)\): .*ndarray"),
-    ({"meta": {"made_by": b"me"}}, "meta must hold what JSON can .*bytes"),
+    ({"points": np.full((30, 16, 3), 900, np.float16)}, "write them in metres"),
+    ({"meta": {"positions_in_state": np.int64(4)}}, "positions_in_state is 4, a state has 9 numb"),
+    ({"meta": {"made_by": b"me"}}, "meta must hold what JSON can, made_by: bytes"),
     ({"meta": {"simulator": 3}}, "simulator must be a name, not 3"),
 ]
 
@@ -264,6 +257,44 @@ def test_what_could_not_be_read_again_is_not_saved(tmp_path, parts, message):
         data.save_demonstrations(tmp_path / "reach.npz", demonstrations)
     assert "\n" not in str(caught.value) and "reach.npz" in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "parts, message",
+    [
+        ({"task": b"reach"}, "task must be text .* not bytes"),
+        ({"instruction": b"Move."}, "instruction must be text .* not bytes"),
+        ({"instruction": None}, "instruction must be text .* not NoneType"),
+        ({"instruction": ["Move."]}, "instruction must be text .* not list"),
+        ({"state": [[0.0] * 9] * 30}, "state must be a NumPy array, not list"),
+        ({"action": torch.zeros(30, 4)}, "action must be a NumPy array, not Tensor"),
+        ({"episode_ends": [20, 30]}, "episode_ends must be a NumPy array, not list"),
+        ({"meta": None}, "meta must be a dict, not NoneType"),
+    ],
+)
+def test_a_part_of_another_type_is_refused_where_the_recording_is_made(parts, message):
+    with pytest.raises(RecordingError, match=message):
+        replace(recording((20, 10)), **parts)
+
+
+def test_numbers_of_numpy_in_meta_are_saved_as_numbers(tmp_path):
+    meta = {"positions_in_state": np.int64(1), "success_frames": np.array([3, 5])}
+    saved = replace(recording((20, 10)), meta=meta)
+    data.save_demonstrations(tmp_path / "reach.npz", saved)
+    found = data.load_demonstrations(tmp_path / "reach.npz").meta
+    assert found == {"positions_in_state": 1, "success_frames": [3, 5]}
+    assert WindowSampler(saved, SIZES, augment=True).augment
+
+
+def test_a_link_stays_a_link_and_a_file_keeps_its_mode(tmp_path):
+    target, link = tmp_path / "shared" / "reach.npz", tmp_path / "link.npz"
+    target.parent.mkdir()
+    link.symlink_to(target)
+    data.save_demonstrations(link, recording())
+    target.chmod(0o660)
+    data.save_demonstrations(link, recording(seed=1))
+    assert link.is_symlink() and stat.S_IMODE(target.stat().st_mode) == 0o660
+    np.testing.assert_array_equal(data.load_demonstrations(target).state, recording(seed=1).state)
 
 
 def with_feature(value):
@@ -295,10 +326,10 @@ def meta(**changes):
 # What replaces parts of a good file of two episodes, 20 and 10 frames, and what is said of it.
 BAD_PARTS = [
     ({"action": None}, "lacks action"),
-    ({"points": NAN}, "points holds NaN"),
+    ({"points": NAN}, "points holds NaN, .* in 30 of 30 frames, first in frame 0: leave such poi"),
     ({"state": np.full((30, 9), np.inf, np.float32)}, "state holds NaN"),
     ({"points": NAN[..., :2]}, "points must be"),
-    ({"points": with_feature(np.nan)}, "points holds NaN"),
+    ({"points": with_feature(np.nan)}, "points holds NaN, .* in 1 of 30 frames, first in frame 29"),
     ({"points": with_feature(255)}, "features of points reach 255: .* write colours from 0 to 1"),
     ({"points": with_feature(-2)}, "features of points reach 2"),
     ({"points": with_empty_cloud(np.zeros((30, 16, 3)))}, "all points of frame 0 are at 0, 0, 0"),
@@ -368,6 +399,79 @@ def test_a_missing_truncated_or_foreign_file_is_refused_in_one_line(tmp_path):
         with pytest.raises(RecordingError, match=message) as caught:
             data.load_demonstrations(path)
         assert "\n" not in str(caught.value)
+
+
+# ---- Suspicions ----------------------------------------------------------------------------------
+
+
+def moved_hand(episodes=6, length=40, seed=0):
+    """A good recording: a hand goes through a cloud, and an action is the next change of it."""
+    rng = np.random.default_rng(seed)
+    frames = episodes * length
+    action = rng.normal(scale=0.01, size=(episodes, length, 7)).cumsum(axis=1) / 10
+    start = rng.uniform(-0.3, 0.3, size=(episodes, 1, 7))
+    state = np.concatenate([start, start + action.cumsum(axis=1)[:, :-1]], axis=1)
+    return Demonstrations(
+        task="stir",
+        instruction="Stir.",
+        points=rng.uniform(-0.5, 0.5, size=(frames, 16, 3)).astype(np.float16),
+        state=state.reshape(frames, 7).astype(np.float32),
+        action=action.reshape(frames, 7).astype(np.float32),
+        episode_ends=np.arange(length, frames + 1, length),
+        meta={"positions_in_state": 1},
+    )
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_a_good_recording_is_not_suspected(absolute):
+    good = moved_hand()
+    action = good.state + good.action if absolute else good.action
+    assert data.suspicions(replace(good, action=action)) == []
+    assert data.suspicions(replace(good, meta={})) == []
+    assert data.suspicions(recording((1,))) == []
+
+
+def test_recordings_of_meta_world_are_not_suspected(recorded):
+    files = sorted(recorded.glob("*.npz"))
+    assert len(files) == 4
+    assert not any(data.suspicions(data.load_demonstrations(file)) for file in files)
+
+
+def spiked(good):
+    state = good.state.copy()
+    state[100, 3] = 1e6
+    return {"state": state}
+
+
+@pytest.mark.parametrize(
+    "fault, message",
+    [
+        (spiked, r"state 3 is 1e\+06 in frame 100 \(episode 2\), while 98 percent .* from -0"),
+        (lambda good: {"state": 1000 * good.state}, "position 0 of the state lies far .* in frame"),
+        (lambda good: {"points": good.points * np.float16(100)}, "the points span 1.* in metres"),
+        (lambda good: {"points": good.points / np.float16(100)}, "the points span 0.0"),
+        (lambda good: {"action": np.roll(good.action, 1, axis=0)}, "state 1 frame earlier"),
+        (lambda good: {"action": np.roll(good.action, -1, axis=0)}, "state 1 frame later"),
+        (
+            lambda good: {"action": np.roll(good.state + good.action, 1, axis=0)},
+            "state 1 frame earlier",
+        ),
+        (
+            lambda good: {"episode_ends": np.array([41, 81, 121, 161, 201, 240])},
+            r"jumps from frame 39 to 40, .* from 40 to 41, where episode 0 ends \(5 .* 1 too large",
+        ),
+        (
+            lambda good: {"episode_ends": np.array([39, 79, 119, 159, 199, 240])},
+            "jumps from frame 39 to 40, but not from 38 to 39, where .* 1 too small",
+        ),
+    ],
+)
+def test_what_looks_wrong_is_said_in_one_line(fault, message):
+    good = moved_hand()
+    wrong = replace(good, **fault(good))
+    wrong.check()
+    (line,) = data.suspicions(wrong)
+    assert re.search(message, line) and "\n" not in line
 
 
 # ---- Windows -------------------------------------------------------------------------------------

@@ -695,6 +695,19 @@ def test_own_recordings_of_any_length_and_dimension_are_trained_on_and_adapted_t
     assert "base tasks" not in capsys.readouterr().out
 
 
+def test_what_looks_wrong_in_recordings_is_said_before_training(capsys, monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    recording = own_recording(90)
+    recording["state"][50, 3] = 1e6
+    save_recording("own", recording)
+    monkeypatch.setattr(train, "fit_to_recordings", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train.main([*SHORT, "--steps", "1", "--data", "own"])
+    assert "own/stir.npz: state 3 is 1e+06 in frame 50 (episode 0)" in capsys.readouterr().out
+
+
 def test_points_with_colours_and_names_of_a_simulators_tasks_are_trained_on():
     """Six columns make a policy of six. What is own is told by the recording, not by its name."""
     save_recording("own", own_recording(90, task="hammer", features=COLORS))
