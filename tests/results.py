@@ -1,4 +1,4 @@
-"""RESULTS.json, and what README and RESULTS.md show of it: tables and charts.
+"""assets/RESULTS.json, and what README and RESULTS.md show of it: tables and charts.
 
     python -m tests.results runs/ml10-dami-seed0   # takes a run of tests.runs into RESULTS.json
     python -m tests.results                        # writes the tables, draws the charts
@@ -42,7 +42,7 @@ from simulator import simulator_of
 from tests.runs import AGAIN, REPORTS
 
 ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "RESULTS.json"
+RESULTS = ROOT / "assets" / "RESULTS.json"
 PAPER = json.loads(PAPER_RESULTS.read_text())
 
 
@@ -169,7 +169,7 @@ def take(results: Results, run: Path) -> None:
         if not path.exists():
             continue
         report = json.loads(path.read_text())
-        for part in ("successes", "checkpoints"):
+        for part in ("successes", "successes at the end", "checkpoints"):
             if part in report:
                 report[part] = {
                     title: {task: as_digits(episodes) for task, episodes in column.items()}
