@@ -176,7 +176,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", default=list(VARIANTS), help="these variants")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of training")
     parser.add_argument("--suite", default="ml10", help="ml10 or ml45")
-    parser.add_argument("--steps", type=int, default=10_000, help="of each training")
+    parser.add_argument("--steps", type=int, default=8_000, help="of each training")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="a task")
     parser.add_argument("--at-once", type=int, default=2, help="runs at a time")
     parser.add_argument("--list", action="store_true", help="only say what is done")
