@@ -146,6 +146,9 @@ def test_the_default_is_the_newest_finished_run_of_the_suite_that_is_not_tiny(ca
     assert evaluate.default_checkpoint("own") == Path("runs/c-own/ema-00005.pt")
     with pytest.raises(evaluate.UserError, match="no finished run on ml45"):
         evaluate.default_checkpoint("ml45")
+    leave("f-tiny", preset="tiny", suite="ml45")
+    with pytest.raises(evaluate.UserError, match=r"f-tiny is a run of `tiny`.* add --checkpoint"):
+        evaluate.default_checkpoint("ml45")
 
 
 def test_a_folder_stands_for_its_last_checkpoint():
@@ -159,6 +162,10 @@ def test_a_folder_stands_for_its_last_checkpoint():
     Path("adapted").mkdir()
     Path("adapted/adapted.pt").touch()
     assert evaluate.checkpoints_of("adapted") == [Path("adapted/adapted.pt")]
+    Path("interrupted").mkdir()
+    Path("interrupted/last.pt").touch()
+    with pytest.raises(evaluate.UserError, match=r"add --resume .* or name interrupted/last.pt"):
+        evaluate.checkpoints_of("interrupted")
 
 
 def test_a_policy_that_does_not_say_how_it_was_trained_is_refused(run, recordings, capsys):

@@ -291,3 +291,12 @@ def test_what_the_user_gets_wrong_ends_in_one_line_and_exit_code_2(
         command_line(lambda: simulator.main(argv), errors=(RecordingError,))
     error = capsys.readouterr().err
     assert end.value.code == 2 and message in error and error.count("\n") == 1
+
+
+def test_who_interrupts_collecting_is_told_what_is_kept(tmp_path, monkeypatch):
+    def interrupt(job, jobs, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(simulator, "run_jobs", interrupt)
+    with pytest.raises(KeyboardInterrupt, match=f"finished are kept in {tmp_path}, the same"):
+        collect(ToySimulator(), [TASK], tmp_path)

@@ -755,7 +755,9 @@ def test_held_out_episodes_are_only_for_measuring(pair, capsys, monkeypatch):
         train.main([*argv, "--out", "runs/held", "--held-out", "1"])
     train.main([*argv, "--out", "runs/held", "--held-out", "1", "--resume"])
     printed = capsys.readouterr().out
-    assert "held-out action error" in printed and re.search(r"\| held_out +\| 1 +\| 0 +\|", printed)
+    assert "held-out action error" in printed
+    assert len(re.findall(r"\| held_out +\| 1 +\| 0 +\|", printed)) == 1  # not when it goes on
+    assert "going on after step 1 of 2" in printed
     assert "next: python finetune.py --data NEW.npz --checkpoint runs/held" in printed
     train.main([*argv, "--out", "runs/first", "--demonstrations", "1"])
     held, first = (whole_state(Path(f"runs/{name}")) for name in ("held", "first"))
