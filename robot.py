@@ -43,7 +43,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation  # scipy comes with metaworld
 
 import baselines  # noqa: F401  its policies are registered
 import common
@@ -165,7 +164,9 @@ def load_settings(path: str | Path) -> Settings:
 # ---- RTDE: the controller's real-time data exchange ----------------------------------------------
 
 HEADER = struct.Struct(">HB")  # size of the whole package, type
-REQUEST_VERSION, SETUP_OUTPUTS, SETUP_INPUTS, START, DATA, MESSAGE = map(ord, "VOISUM")
+REQUEST_PROTOCOL, REQUEST_CONTROLLER = ord("V"), ord("v")
+SETUP_OUTPUTS, SETUP_INPUTS, START, DATA, MESSAGE = map(ord, "OISUM")
+OLDEST = (5, 5, 1)  # of the controller's software: the first of an e-Series that tells `tcp_offset`
 FORMATS = {"INT32": ">i4", "UINT32": ">u4", "DOUBLE": ">f8", "VECTOR6D": "(6,)>f8"}  # for numpy
 OUTPUTS = tuple(
     "timestamp actual_TCP_pose tcp_offset payload target_speed_fraction robot_mode safety_mode "
@@ -195,12 +196,17 @@ class State(NamedTuple):
         """TCP pose (6,), metres and axis-angle, base frame."""
         return self.values["actual_TCP_pose"].astype(float)
 
+    @property
+    def safety(self) -> str:
+        """The name of the safety mode."""
+        mode = int(self.values["safety_mode"])
+        return SAFETY.get(mode, str(mode))
+
     def trouble(self) -> str | None:
         """Why the arm must not be moved in this state; None if it may."""
         v = self.values
         if v["safety_mode"] not in (1, 2) or v["safety_status_bits"] & STOPPED:
-            mode = SAFETY.get(int(v["safety_mode"]), v["safety_mode"])
-            return f"safety: {mode} (status bits {v['safety_status_bits']:#x})"
+            return f"safety: {self.safety} (status bits {v['safety_status_bits']:#x})"
         if v["robot_mode"] != RUNNING:
             return f"the robot is not running (robot mode {v['robot_mode']}, {RUNNING} is running)"
         if (slider := v["target_speed_fraction"]) < 0.99:
@@ -226,9 +232,23 @@ class RTDE:
             self.socket = socket.create_connection((host, port), 2.0)
         except OSError as error:
             raise self.lost(f"cannot be reached: {error}") from None
+        try:
+            self.handshake(hz, write)
+        except BaseException:
+            self.socket.close()
+            raise
+        self.thread = threading.Thread(target=self.read, name="RTDE", daemon=True)
+        self.thread.start()
+
+    def handshake(self, hz: float, write: bool) -> None:
+        """Agrees on protocol and recipes, and starts the states."""
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if self.request(REQUEST_VERSION, struct.pack(">H", 2))[:1] != b"\x01":
+        if self.request(REQUEST_PROTOCOL, struct.pack(">H", 2))[:1] != b"\x01":
             raise self.lost("protocol version 2 is refused: update the controller's software")
+        reply = self.request(REQUEST_CONTROLLER, b"")
+        if len(reply) != 16:
+            raise self.lost(f"framing lost (a controller's version of {len(reply)} bytes)")
+        self.version = struct.unpack(">4I", reply)[:3]  # of the controller's software
         reply = self.request(SETUP_OUTPUTS, struct.pack(">d", hz) + ",".join(OUTPUTS).encode())
         self.output_recipe, self.output_format = self.recipe(reply, OUTPUTS)
         if write:
@@ -236,8 +256,6 @@ class RTDE:
             self.input_recipe, self.input_format = self.recipe(reply, INPUTS)
         if self.request(START, b"")[:1] != b"\x01":
             raise self.lost("it does not start sending")
-        self.thread = threading.Thread(target=self.read, name="RTDE", daemon=True)
-        self.thread.start()
 
     def lost(self, what: str) -> RobotError:
         return RobotError(f"{self.name}: {what}{self.said}")
@@ -245,7 +263,11 @@ class RTDE:
     def recipe(self, reply: bytes, names: Sequence[str]) -> tuple[bytes, np.dtype]:
         """The recipe's id and layout, from the answer to a set-up."""
         types = reply[1:].decode("ascii", "replace").strip(",").split(",")
-        advice = {"IN_USE": "another client holds it", "NOT_FOUND": "not known to the controller"}
+        software = "software {}.{}.{}".format(*self.version)
+        unknown = f"not known to the controller's {software}"
+        if self.version < OLDEST:
+            unknown += ": update it, {}.{}.{} or later is needed".format(*OLDEST)
+        advice = {"IN_USE": "another client holds it", "NOT_FOUND": unknown}
         for name, kind in zip(names, types):
             if kind not in FORMATS:
                 raise self.lost(f"field {name} is {kind} ({advice.get(kind, 'an unknown type')})")
@@ -635,16 +657,42 @@ class RecordedCamera:
 # ---- Streaming motion ----------------------------------------------------------------------------
 
 
+def quaternion(rotvec: Sequence[float]) -> tuple[float, float, float, float]:
+    """The unit quaternion (w, x, y, z) of a rotation vector (3,)."""
+    x, y, z = rotvec
+    angle = math.sqrt(x * x + y * y + z * z)
+    scale = math.sin(angle / 2) / angle if angle > 1e-9 else 0.5
+    return math.cos(angle / 2), scale * x, scale * y, scale * z
+
+
+def rotate(rotvec: Sequence[float], turn: Sequence[float]) -> np.ndarray:
+    """The rotation vector (3,) of one rotation, then another; its angle is at most pi.
+
+    Plain numbers, and not an array library: the servo's thread does this ten times in 8 ms, and it
+    takes five microseconds, in which it keeps Python's lock from all others.
+    """
+    aw, ax, ay, az = quaternion(turn)
+    bw, bx, by, bz = quaternion(rotvec)
+    w = aw * bw - ax * bx - ay * by - az * bz
+    x = aw * bx + bw * ax + ay * bz - az * by
+    y = aw * by + bw * ay + az * bx - ax * bz
+    z = aw * bz + bw * az + ax * by - ay * bx
+    sine = math.sqrt(x * x + y * y + z * z)
+    angle = 2 * math.atan2(sine, abs(w))
+    scale = math.copysign(angle / sine if sine > 1e-9 else 2.0, w)
+    return np.array([scale * x, scale * y, scale * z])
+
+
 def compose(pose: np.ndarray, action: np.ndarray) -> np.ndarray:
     """Pose (6,) and relative action (>= 6,) -> the pose (6,) it leads to."""
-    rotation = Rotation.from_rotvec(action[3:6]) * Rotation.from_rotvec(pose[3:])
-    return np.concatenate([pose[:3] + action[:3], rotation.as_rotvec()])
+    rotvec = rotate(pose[3:].tolist(), action[3:6].tolist())
+    return np.concatenate([pose[:3] + action[:3], rotvec])
 
 
 def difference(pose: np.ndarray, later: np.ndarray) -> np.ndarray:
     """The action (6,) that leads from one pose to a later one; the inverse of `compose`."""
-    rotation = Rotation.from_rotvec(later[3:]) * Rotation.from_rotvec(pose[3:]).inv()
-    return np.concatenate([later[:3] - pose[:3], rotation.as_rotvec()])
+    turn = rotate((-pose[3:]).tolist(), later[3:].tolist())
+    return np.concatenate([later[:3] - pose[:3], turn])
 
 
 def nearer(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -662,6 +710,15 @@ def lengths(steps: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.reshape(steps[..., :6], (*steps.shape[:-1], 2, 3)), axis=-1)
 
 
+def distance(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """How far two poses (6,) are apart: metres and radians (2,).
+
+    Poses are compared by this alone. Their six numbers may differ by a whole turn where the poses
+    are the same, since a rotation by nearly pi, as of a tool that points down, has two vectors.
+    """
+    return lengths(difference(pose, other))
+
+
 def toward(pose: np.ndarray, target: np.ndarray, most: np.ndarray) -> np.ndarray:
     """From pose to target (6,), by no more than (metres, radians): straight, and on SO(3)."""
     step = difference(pose, target)
@@ -676,12 +733,18 @@ def jump(steps: Sequence[np.ndarray], settings: Settings) -> str | None:
     return None
 
 
+ROUNDING = 1e-6  # metres: a corner of the box that was written as float32 is still in it
+
+
 def refusal(poses: Sequence[np.ndarray], settings: Settings) -> str | None:
     """Why an arm must not go through these poses (6,), one every 1 / policy_hz; None if it may."""
     if reason := jump([difference(*pair) for pair in itertools.pairwise(poses)], settings):
         return reason
+    if not np.isfinite(poses).all():
+        return "a pose is not finite"
     for x in (pose[:3] for pose in poses):
-        if ((x < settings.tcp_low_m) | (x > settings.tcp_high_m)).any():
+        outside = np.maximum(settings.tcp_low_m - x, x - settings.tcp_high_m).max()
+        if not outside <= ROUNDING:  # NaN, too
             return f"the TCP is outside its box, at {', '.join(f'{i:.3f}' for i in x)} m"
     return None
 
@@ -713,6 +776,7 @@ class Servo:
 
     DELAY = 0.025  # seconds from measuring a pose to following the answer
     PATIENCE = 5.0  # seconds for the program to start
+    REACHED = 1e-6  # metres and radians from the target: nothing is left to go
     SLOW = "the policy or the camera is too slow"
 
     def __init__(self, rtde: RTDE, settings: Settings, moves: bool = True, free: bool = False):
@@ -770,12 +834,7 @@ class Servo:
         with self.lock:
             poses, now = [self.pose], time.monotonic()
             for action in actions:
-                pose = compose(poses[-1], action)
-                if settings.outside_box == "clamp":
-                    asked = pose[:3].copy()
-                    pose[:3] = asked.clip(settings.tcp_low_m, settings.tcp_high_m)
-                    self.clamped += not np.array_equal(pose[:3], asked)
-                poses.append(pose)
+                poses.append(self.into_box(compose(poses[-1], action)))
             if reason := refusal(poses, settings):
                 self.fail(reason)
             when = now + np.arange(1, len(poses)) / settings.policy_hz
@@ -793,14 +852,42 @@ class Servo:
         return int((lengths(actions) * self.settings.policy_hz > self.speed).any(axis=1).sum())
 
     def go(self, pose: np.ndarray) -> None:
-        """Goes straight to a pose (6,) at a quarter of the speed allowed; returns when there."""
-        step, settings = difference(self.pose, pose), self.settings
-        n = math.ceil((lengths(step) / self.speed).max() * 4 * settings.policy_hz) or 1
-        self.follow(np.tile(np.append(step / n, 0.0), (n, 1)))
-        behind = 3 * settings.servo_lookahead_s
-        while self.targets or time.monotonic() < self.held_since + behind:
+        """Goes straight to a pose (6,) at a quarter of the speed allowed; returns when there.
+
+        The line is divided into targets that are 0.1 s apart, whatever `policy_hz` and `max_step_m`
+        say of a policy's steps. The last of them is repeated until an arm that lags by servoj's
+        lookahead time has arrived, too. The box is convex: with both ends the line lies in it.
+        """
+        settings = self.settings
+        with self.lock:
+            start, now = self.pose, time.monotonic()
+            pose = self.into_box(pose)
+            if reason := refusal([start], settings) or refusal([pose], settings):
+                self.fail(reason)
+                self.check()
+            step = difference(start, pose)
+            seconds = 4 * float((lengths(step) / self.speed).max())
+            n = max(1, math.ceil(seconds / 0.1))
+            self.targets = [
+                (now + seconds * i / n, compose(start, step * i / n)) for i in range(1, n + 1)
+            ]
+            arrived = now + seconds + 3 * settings.servo_lookahead_s
+            self.targets.append((arrived, self.targets[-1][1]))
+            self.broken_off = False
+        while self.targets:
             self.check()
+            if time.monotonic() > arrived + 1.0:
+                self.fail("the pose that the arm was sent to is not reached")
             time.sleep(0.01)
+        self.check()
+
+    def into_box(self, pose: np.ndarray) -> np.ndarray:
+        """The pose (6,), or with `outside_box` "clamp" the nearest one inside the box."""
+        if self.settings.outside_box != "clamp":
+            return pose
+        inside = pose[:3].clip(self.settings.tcp_low_m, self.settings.tcp_high_m)
+        self.clamped += bool(abs(inside - pose[:3]).max() > ROUNDING)
+        return np.concatenate([inside, pose[3:]])
 
     def tick(self, now: float) -> np.ndarray:
         """The pose to command now: toward the next target, on time, no faster than allowed."""
@@ -813,7 +900,7 @@ class Servo:
                 share = min(1.0, dt / max(when - now + dt, dt))
                 goal = compose(self.pose, share * difference(self.pose, target))
                 self.pose = toward(self.pose, goal, self.speed * dt)
-                if when <= now and np.allclose(self.pose, target, atol=1e-6):
+                if when <= now and distance(self.pose, target).max() < self.REACHED:
                     self.targets = []
                 self.held_since = now
             return self.pose
@@ -823,19 +910,25 @@ class Servo:
         period, due = 1 / self.settings.servo_hz, time.monotonic()
         try:
             while not self.ended.is_set() and self.error is None:
-                state, now = self.rtde.state(self.settings.max_state_age_s), time.monotonic()
-                if reason := self.trouble(state, now):
-                    return self.fail(reason)
-                pose = state.pose if self.free else self.tick(now)
-                if self.moves:
-                    self.send(toward(state.pose, pose, self.lead))
+                now = time.monotonic()
                 self.lateness.append(now - due)
-                self.ages.append(now - state.received)
+                self.step()
                 due = max(due + period, now - period)  # no burst to catch up after a pause
                 time.sleep(max(0.0, due - time.monotonic()))
         except Exception as error:  # whatever it is: without this thread the arm must not go on
             known = isinstance(error, RobotError)
             self.fail(str(error) if known else f"the stream broke off: {error!r}")
+
+    def step(self) -> None:
+        """One package: the pose to command now, if the newest state allows it."""
+        state = self.rtde.state(self.settings.max_state_age_s)
+        now = time.monotonic()
+        if reason := self.trouble(state, now):
+            return self.fail(reason)
+        pose = state.pose if self.free else self.tick(now)
+        if self.moves:
+            self.send(toward(state.pose, pose, self.lead))
+        self.ages.append(now - state.received)
 
     def trouble(self, state: State, now: float) -> str | None:
         """Why the arm must stop in this state; None if it need not."""
@@ -859,7 +952,7 @@ class Servo:
             return f"states arrive {delay - self.delay:.3f} s later than at first"
         if self.free:
             return None
-        metres, radians = lengths(difference(state.pose, self.pose))
+        metres, radians = distance(state.pose, self.pose)
         if self.moves and (metres > settings.max_lag_m or radians > settings.max_lag_rad):
             return f"the arm is {metres:.3f} m, {radians:.3f} rad behind: blocked, or slowed down"
         if now - self.held_since > settings.max_hold_s:
@@ -963,10 +1056,24 @@ class Cell:
         now["gripper_open_at"] = settings.gripper_open_at
         now["workspace"] = boxes(settings)["workspace"]
         for name, value in now.items():
-            if recording and (found := recording.meta.get(name)) != value:
-                made = f"{recording.task} was recorded with {name} {found}"
-                raise UserError(f"{made}, now it is {value}: set it as it was, or record again")
+            recorded = recording.meta.get(name) if recording else value
+            if name == "tcp_offset" and same_tcp(recorded, value):
+                continue
+            if recorded != value:
+                raise UserError(
+                    f"{recording.task} was recorded with {name} {recorded}, now it is {value}: "
+                    "set it as it was, or record again"
+                )
         return now | boxes(settings)
+
+
+def same_tcp(recorded: Any, offset: list[float]) -> bool:
+    """Whether two offsets of the TCP are the same pose, to 0.2 mm and 0.2 mrad."""
+    if not isinstance(recorded, list) or {type(x) for x in recorded} - {int, float}:
+        return False
+    if len(recorded) != 6:
+        return False
+    return bool(distance(np.array(recorded), np.array(offset)).max() < 2e-4)
 
 
 def boxes(settings: Settings) -> dict:
@@ -1136,31 +1243,40 @@ def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callabl
 
 
 class Keys:
-    """The keys pressed so far, one at a time, without waiting: of a terminal, or of stdin."""
+    """The keys pressed so far, one at a time, without waiting.
+
+    They are those of the terminal, where no Enter is needed. Where standard input is no terminal,
+    they are what a script, or the driver of a foot pedal, writes into it; its end means `q`.
+    """
 
     def __enter__(self) -> Keys:
-        import termios  # Windows has neither
-        import tty
+        if sys.stdin is None or sys.stdin.closed:
+            raise UserError("standard input is closed: use a terminal, or write the keys into it")
+        self.terminal = sys.stdin.isatty()
+        if self.terminal:
+            import termios  # Windows has neither
+            import tty
 
-        self.old = termios.tcgetattr(sys.stdin) if sys.stdin.isatty() else None
-        if self.old is not None:
-            tty.setcbreak(sys.stdin)  # no Enter is needed
+            self.attributes = termios.tcgetattr(sys.stdin)
+            tty.setcbreak(sys.stdin)
         return self
 
     def __exit__(self, *_: Any) -> None:
-        import termios
+        if self.terminal:
+            import termios
 
-        if self.old is not None:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self.old)
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self.attributes)
 
     def pressed(self) -> str:
-        """One key, or an empty string. Raises RobotError at the end of the input."""
+        """One key, or an empty string. Raises RobotError where the terminal is gone."""
         while select.select([sys.stdin], [], [], 0)[0]:
             key = os.read(sys.stdin.fileno(), 1).decode("ascii", "replace")  # unbuffered
+            if key == "" and self.terminal:
+                raise RobotError("the terminal is gone")
             if key == "":
-                raise RobotError("the input has ended")
-            if key != "\n":
-                return key
+                return "q"
+            if not key.isspace():
+                return key.lower()
         return ""
 
 
@@ -1214,6 +1330,8 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
                     grip.append(closed)
                 due = max(due + 1 / settings.policy_hz, time.monotonic())
                 time.sleep(max(0.0, due - time.monotonic()))
+            if frames is not None:
+                print("dropped: the last episode was not ended by e", flush=True)
         except RobotError as error:
             before = f"{len(kept)} are in {out}" if kept else "none was kept before"
             raise RobotError(f"{error}; the episode at hand is dropped, {before}") from error
@@ -1243,7 +1361,13 @@ def finish(frames: list[Frame], grip: list[float], settings: Settings) -> tuple[
 def check(args: argparse.Namespace, settings: Settings) -> None:
     """Connects to everything, moves nothing, and says what it found."""
     asked = ("robotmode", "safetystatus", "programState", "is in remote control")
-    answers = dashboard(args.host, settings.dashboard_port, *asked)
+    try:
+        answers = dashboard(args.host, settings.dashboard_port, *asked)
+    except RobotError as error:  # nothing but `check` needs it
+        answers = {
+            "dashboard": f"none ({error}): PolyScope X has none, elsewhere enable it",
+            "is in remote control": "unknown: look at the panel",
+        }
     with connect(args, settings, write=False) as cell:
         state = cell.rtde.state(settings.max_state_age_s)
         trouble = state.trouble() or refusal([state.pose], settings)
@@ -1254,6 +1378,8 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
         low, high = kept.min(0).round(3), kept.max(0).round(3)
         ready = cell.gripper.exchange(READ, INITIALIZED, 1)
         rows = answers | {
+            "controller": "software {}.{}.{}, ".format(*cell.rtde.version)
+            + f"robot mode {state.values['robot_mode']}, safety {state.safety}",
             "TCP, m and rad": " ".join(f"{x:.3f}" for x in state.pose),
             "state": trouble or "ready",
             "recorded with": cell.made_with(),

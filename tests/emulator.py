@@ -66,6 +66,7 @@ class Faults:
     """What goes wrong; set at any time."""
 
     refuse_version: bool = False
+    version: tuple = (5, 15, 0)  # of the controller's software; 10 is PolyScope X
     not_found: set[str] = field(default_factory=set)
     in_use: set[str] = field(default_factory=set)
     silent: bool = False  # no more data packages: the state grows stale
@@ -408,7 +409,7 @@ class Emulator:
             if kind == "V":
                 send("V", bytes([payload == b"\0\2" and not self.faults.refuse_version]))
             elif kind == "v":
-                send("v", struct.pack(">IIII", 5, 15, 0, 0))
+                send("v", struct.pack(">IIII", *self.faults.version, 0))
             elif kind == "O":
                 (frequency,) = struct.unpack_from(">d", payload)
                 fields, kinds = set_up(payload[8:], TYPES)

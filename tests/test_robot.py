@@ -34,7 +34,7 @@ import report
 import robot
 from robot import RTDE, Gripper, RobotError, Servo, Settings
 from tests.emulator import START_POSE, Emulator, write_scene
-from tests.fuzz_robot import fuzz_robot
+from tests.fuzz_robot import fuzz_pose, fuzz_robot, simulated_arm
 
 ROOT = Path(__file__).parents[1]
 CAMERA_TO_BASE = [[1, 0, 0, -0.2], [0, -1, 0, -0.55], [0, 0, -1, 0.9], [0, 0, 0, 1]]
@@ -145,6 +145,31 @@ def test_what_the_controller_refuses_is_named(emulator, settings):
     emulator.faults.in_use, emulator.faults.refuse_version = set(), True
     with pytest.raises(RobotError, match="protocol version 2"):
         connect(settings)
+
+
+def test_old_software_is_refused_with_the_advice_to_update(emulator, settings):
+    emulator.faults.not_found, emulator.faults.version = {"tcp_offset"}, (5, 4, 3)
+    advice = r"tcp_offset is NOT_FOUND .*software 5\.4\.3: update it, 5\.5\.1 or later is needed"
+    with pytest.raises(RobotError, match=advice):
+        connect(settings)
+    emulator.faults.version = (10, 7, 0)  # of PolyScope X: an update is no cure
+    with pytest.raises(RobotError, match=r"not known to the controller's software 10\.7\.0\)"):
+        connect(settings)
+
+
+def test_a_handshake_that_fails_closes_its_connection(emulator, settings, monkeypatch):
+    opened, create = [], socket.create_connection
+
+    def remember(*args):
+        opened.append(create(*args))
+        return opened[-1]
+
+    monkeypatch.setattr(socket, "create_connection", remember)
+    for fault in ({"refuse_version": True}, {"not_found": {"payload"}}, {"drop": True}):
+        emulator.faults = type(emulator.faults)(**fault)
+        with pytest.raises(RobotError):
+            connect(settings)
+        assert opened.pop().fileno() == -1
 
 
 def test_two_clients_cannot_both_write_and_the_registers_are_free_again_afterwards(
@@ -296,6 +321,18 @@ def test_relative_actions_compose_and_differ_consistently():
         )
 
 
+def test_rotations_compose_as_scipys_do_near_0_and_near_pi_too():
+    rng = np.random.default_rng(0)
+    for size in (0.0, 1e-12, 1e-6, 1.0, np.pi - 1e-9, np.pi):
+        for _ in range(20):
+            first, second = rng.normal(size=(2, 3))
+            first *= size / np.linalg.norm(first)
+            both = robot.rotate(first, second)
+            theirs = Rotation.from_rotvec(second) * Rotation.from_rotvec(first)
+            assert (Rotation.from_rotvec(both) * theirs.inv()).magnitude() < 1e-9
+            assert np.linalg.norm(both) < np.pi + 1e-12
+
+
 def test_interpolation_is_straight_and_scipys_slerp():
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -313,6 +350,55 @@ def test_interpolation_is_straight_and_scipys_slerp():
 
 
 # ---- Motion --------------------------------------------------------------------------------------
+
+
+def test_a_tool_that_points_down_arrives_although_its_rotation_vector_may_flip():
+    settings = Settings(**BOXES, max_speed_rad_s=2.0, max_lag_rad=0.4)
+    for angle in np.linspace(0, 6, 12):
+        down = np.array([-0.2, -0.5, 0.3, np.pi * np.cos(angle), np.pi * np.sin(angle), 0.0])
+        start = robot.compose(down, np.array([0.01, 0.0, 0.0, 0.1, -0.1, 0.05]))
+        with simulated_arm(settings, start) as arm:
+            arm.servo.go(down)
+            assert robot.distance(arm.pose, down).max() < 5e-3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_pose_in_the_box_is_reached_in_the_time_that_the_way_needs(seed):
+    seconds, needed = fuzz_pose(seed)
+    assert needed <= seconds <= needed + 1
+
+
+def test_a_servo_that_does_not_arrive_is_stopped_and_holds_nothing_for_ever(monkeypatch):
+    monkeypatch.setattr(Servo, "REACHED", -1.0)  # it can never be near enough
+    with simulated_arm(Settings(**BOXES), np.array(START_POSE)) as arm:
+        with pytest.raises(RobotError, match="is not reached"):
+            arm.servo.go(robot.compose(np.array(START_POSE), np.full(6, 0.01)))
+        assert arm.stopped
+
+
+def test_a_corner_of_the_box_that_was_rounded_to_float32_can_be_gone_to():
+    high = np.array([0.2, -0.2, 0.6])
+    recorded = np.append(high.astype(np.float32).astype(float), START_POSE[3:])
+    assert (recorded[:3] > high).any()
+    with simulated_arm(Settings(**BOXES), np.array([0.19, -0.21, 0.59, *START_POSE[3:]])) as arm:
+        arm.servo.go(recorded)
+    for change, message in (
+        ([1e-5, 0, 0, 0, 0, 0], "outside its box"),
+        ([np.nan, 0, 0, 0, 0, 0], "not finite"),
+        ([0, 0, 0, 0, 0, np.nan], "not finite"),
+    ):
+        with simulated_arm(Settings(**BOXES), np.array(START_POSE)) as arm:
+            with pytest.raises(RobotError, match=message):
+                arm.servo.go(recorded + np.array(change))
+            assert arm.stopped
+
+
+def test_the_same_tcp_is_the_same_whatever_its_rotation_vector():
+    down = [0.0, 0.0, 0.17, 0.0, 3.1416, 0.0]
+    assert robot.same_tcp(down, [0.0, 0.0, 0.17005, 0.0, -3.1416, 0.0])
+    assert not robot.same_tcp(down, [0.0, 0.0, 0.171, 0.0, 3.1416, 0.0])
+    for other in (None, [0.0], "no list", [None] * 6):
+        assert not robot.same_tcp(other, down)
 
 
 def test_of_the_two_vectors_of_a_rotation_the_nearer_is_taken():
@@ -1002,6 +1088,33 @@ class Typing:
                 os.write(writing, f"{key}\n".encode())
 
 
+class Script:
+    """Standard input that a script has written, and closed."""
+
+    def __init__(self, monkeypatch, text):
+        reading, writing = os.pipe()
+        os.write(writing, text.encode())
+        os.close(writing)
+        monkeypatch.setattr(sys, "stdin", os.fdopen(reading))
+
+
+def test_a_script_that_has_written_its_keys_ends_the_recording(monkeypatch, capsys):
+    Script(monkeypatch, "s\r\n E\n")
+    with robot.Keys() as keys:
+        assert [keys.pressed() for _ in range(4)] == ["s", "e", "q", "q"]
+    monkeypatch.setattr(sys, "stdin", None)  # of a service
+    with pytest.raises(common.UserError, match="standard input is closed"):
+        robot.Keys().__enter__()
+
+
+def test_a_recording_can_be_driven_without_a_terminal(emulator, cell, monkeypatch, capsys):
+    Script(monkeypatch, "s......e s")  # other keys mean nothing, and take a frame each
+    assert ends(record(cell, 2)) == 0
+    assert "dropped: the last episode was not ended" in capsys.readouterr().out
+    assert len(data.load_demonstrations("demos/stack-cube.npz")) == 1
+    assert is_held(emulator)
+
+
 def record(cell, episodes, *more):
     task = ["--task", "stack-cube", "--instruction", "Stack the cube."]
     return ["record", *cell, *task, "--episodes", str(episodes), *more]
@@ -1037,6 +1150,20 @@ def test_check_reports_everything_and_moves_nothing(emulator, cell, capsys):
         assert message in capsys.readouterr().err
     assert emulator.received == [] and emulator.programs == []
     assert all(frame[1] == 3 for frame in emulator.gripper_frames)  # reads only
+
+
+def test_check_needs_no_dashboard_which_polyscope_x_does_not_have(emulator, cell, capsys):
+    emulator.faults.version = (10, 7, 0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]  # where nobody listens afterwards
+    content = json.loads(Path("robot.json").read_text())
+    Path("robot.json").write_text(json.dumps(content | {"dashboard_port": port}))
+    assert ends(["check", *cell]) == 0
+    printed = capsys.readouterr().out
+    for part in ("PolyScope X has none", "unknown: look at the panel", "software 10.7.0", "ready"):
+        assert part in printed, part
+    emulator.faults.safety_mode = 3
+    assert ends(["check", *cell]) == 2 and "protective stop" in capsys.readouterr().err
 
 
 def test_the_picture_shows_the_cloud_and_both_boxes_of_any_data(tmp_path, monkeypatch):
