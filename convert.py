@@ -37,7 +37,7 @@ from data import (
     save_demonstrations,
 )
 from report import plot_demonstration
-from robot import CameraError, cloud, no_pose, unfit
+from robot import CameraError, check_value, cloud
 
 # What the JSON of --camera may hold. Without a pose points stay in the frame of the camera: right,
 # down, forward. The positions in a state must be in the frame of the points.
@@ -223,10 +223,12 @@ def read_camera(path: Path) -> dict[str, Any]:
         if name not in CAMERA:
             refuse(path, f"{name} is none of {', '.join(CAMERA)}")
         shape = (4,) if name == "intrinsics" else np.shape(CAMERA[name])
-        if problem := unfit(value, "float", shape=shape, least=-1e5, most=1e5):
-            refuse(path, f"{name}: {problem}")
-        if problem := name == "camera_to_base" and no_pose(value):
-            refuse(path, f"{name}: {problem}")
+        try:
+            check_value(
+                value, "float", shape=shape, least=-1e5, most=1e5, rigid=name == "camera_to_base"
+            )
+        except ValueError as error:
+            refuse(path, f"{name}: {error}")
         if name == "intrinsics" and min(value[:2]) <= 0:
             refuse(path, "intrinsics: two focal lengths in pixels, then the principal point")
     return given

@@ -96,11 +96,14 @@ class SimulatedArm:
     sockets, and no thread: to sleep is to let both go on for so long.
     """
 
-    said = ""
+    controller_said = ""
 
     def __init__(self, settings: robot.Settings, pose: np.ndarray) -> None:
         self.settings, self.pose, self.sent, self.count = settings, pose, pose, 0
         self.now, self.due, self.stopped = 100.0, 100.0, False
+        self.computed = 0.0  # seconds of a processor
+        self.stale: robot.StaleState | None = None  # why there is no state
+        self.runs = True  # the program
         self.servo = robot.Servo(self, settings)
         self.servo.held_since = self.now
 
@@ -119,6 +122,8 @@ class SimulatedArm:
         self.now = until
 
     def state(self, max_age: float = 0.1) -> robot.State:
+        if self.stale is not None:
+            raise self.stale
         values = {
             "timestamp": self.now,
             "actual_TCP_pose": self.pose,
@@ -131,7 +136,7 @@ class SimulatedArm:
         return robot.State(values, self.now)
 
     def program_runs(self, state: robot.State) -> bool:
-        return True
+        return self.runs
 
     def send(self, pose: np.ndarray, stop: bool = False) -> None:
         self.sent, self.stopped = pose, stop
@@ -146,6 +151,7 @@ def simulated_arm(settings: robot.Settings, pose: np.ndarray):
         clock.monotonic = lambda: 100.0
         arm = SimulatedArm(settings, pose)
         clock.monotonic, clock.sleep = arm.monotonic, arm.sleep
+        clock.process_time = lambda: arm.computed
         yield arm
 
 

@@ -124,11 +124,8 @@ def test_the_state_is_read_whole_however_the_bytes_arrive(emulator, settings):
         state = rtde.state(0.5)
         np.testing.assert_allclose(state.pose, START_POSE)
         v = state.values
-        assert (v["robot_mode"], v["safety_mode"], v["robot_status_bits"]) == (
-            7,
-            1,
-            1,
-        ) and state.trouble() is None
+        assert (v["robot_mode"], v["safety_mode"], v["robot_status_bits"]) == (7, 1, 1)
+        state.check()
         first = v["timestamp"]
         time.sleep(0.2)
         assert rtde.state(0.5).values["timestamp"] > first
@@ -362,8 +359,9 @@ def test_a_tool_that_points_down_arrives_although_its_rotation_vector_may_flip()
             assert robot.distance(arm.pose, down).max() < 5e-3
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, 59, 74])
 def test_every_pose_in_the_box_is_reached_in_the_time_that_the_way_needs(seed):
+    """Of these two end where a rotation vector flips its sign."""
     seconds, needed = fuzz_pose(seed)
     assert needed <= seconds <= needed + 1
 
@@ -492,7 +490,7 @@ def test_a_target_outside_the_box_is_clamped_if_asked(emulator, settings):
 @pytest.mark.parametrize(
     "fault, message",
     [
-        ({"silent": True}, "the newest state is 0."),
+        ({"silent": True}, "no newer one has arrived: look for the network or the controller"),
         ({"drop": True}, "connection"),
         ({"garbage": True}, "framing lost"),
         ({"safety_mode": 3, "safety_status_bits": 0b100}, "safety: protective stop"),
@@ -516,13 +514,12 @@ def test_trouble_with_the_controller_stops_the_arm_for_good(emulator, settings, 
         for name, value in fault.items():
             setattr(emulator.faults, name, value)
         assert message in stops(servo)
-        count = len(emulator.received) + (0 if "deaf" in fault else 1)  # and the stop
         emulator.faults = type(emulator.faults)()  # all is well again, but the arm stays stopped
         with pytest.raises(RobotError, match=message):
             servo.follow(STILL)
         time.sleep(0.05)
-        later = [fields["input_int_register_24"] for _, fields in emulator.received[count:]]
-        assert not any(later) or "deaf" in fault  # what the deaf one had not read
+        commands = [fields["input_int_register_24"] for _, fields in emulator.received]
+        assert robot.STOP not in commands[:-1]  # nothing comes after it
     assert_within_limits(emulator, settings)
     assert not any(
         line.startswith(("unlock", "power", "brake", "play")) for line in emulator.dashboard_lines
@@ -730,14 +727,78 @@ def test_states_that_come_later_and_later_stop_the_arm(emulator, settings):
         servo.thread.join()
         servo.delay = math.inf  # the first state below is the promptest
         state, now = servo.rtde.state(), time.monotonic()
-        for tick in range(200):  # the network delays each package by 2 ms more than the one before
-            values = state.values.copy()
-            values["timestamp"] += 0.008 * tick
-            values["output_int_register_25"] += tick
-            late = servo.trouble(state._replace(values=values), now + 0.010 * tick)
-            if late:
-                break
-        assert "later than at first" in late and 0.25 < 0.002 * tick < 0.3
+        with pytest.raises(RobotError, match="later than at first"):
+            for tick in range(200):  # each package is delayed by 2 ms more than the one before
+                values = state.values.copy()
+                values["timestamp"] += 0.008 * tick
+                values["output_int_register_25"] += tick
+                servo.check_state(state._replace(values=values), now + 0.010 * tick)
+        assert 0.25 < 0.002 * tick < 0.3
+
+
+@pytest.mark.parametrize(
+    "computed, activity, culprit",
+    [
+        (0.10, "sampling the cloud", "it kept Python's lock, or all processors"),
+        (0.01, "sampling the cloud", "other programs had the processors"),
+        (0.01, robot.WRITING, "the disk is slow"),
+    ],
+)
+def test_a_state_that_is_late_since_the_computer_is_busy_says_with_what(
+    computed, activity, culprit
+):
+    with simulated_arm(Settings(**BOXES), np.array(START_POSE)) as arm:
+        arm.computed = 5.0
+        arm.servo.step()
+        with arm.servo.activity.during("reading the camera"):
+            arm.now += 0.01
+        with arm.servo.activity.during(activity):
+            arm.now += 0.09
+        arm.now += 0.006
+        arm.computed += computed
+        arm.stale = robot.StaleState("the newest state is 0.106 s old", arrived=True)
+        with pytest.raises(RobotError) as caught:
+            arm.servo.step()
+        arm.stale, arm.runs = None, False
+        with pytest.raises(RobotError) as ended:
+            arm.servo.step()
+    message = str(caught.value)
+    assert message.startswith("the newest state is 0.106 s old, but newer ones have arrived")
+    stall = message.partition("arrived")[2]
+    assert str(ended.value) == f"the program on the controller has ended, or is paused{stall}"
+    assert f"For 0.106 s the stream stood still, in which this program computed for {computed:.3f}"
+    assert f"longest at {activity}, 0.090 s: {culprit}" in message
+
+
+def test_what_the_main_thread_is_at_counts_too_and_what_is_long_ago_does_not(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(robot, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    activity = robot.Activity()
+    assert activity.longest(0.0, 1.0) == ("waiting", 0.0)
+    with activity.during("long ago"):
+        now[0] = 5.0
+    with activity.during("computing actions"):
+        now[0] = 5.5
+        assert activity.longest(4.9, 5.5) == ("computing actions", 0.5)
+
+
+def test_a_late_state_that_has_arrived_is_told_from_one_that_has_not(emulator, settings):
+    rtde = connect(settings, write=False)
+    rtde.state(0.5)
+    rtde.package = lambda: time.sleep(0.5) or ("?", b"")  # the reader's thread gets no turn
+    time.sleep(0.2)
+    with pytest.raises(robot.StaleState, match="the newest state is") as caught:
+        rtde.state(0.05)
+    assert caught.value.arrived
+    rtde.close()
+    rtde = connect(settings, write=False)
+    rtde.state(0.5)
+    emulator.faults.silent = True
+    time.sleep(0.2)
+    with pytest.raises(robot.StaleState) as caught:
+        rtde.state(0.05)
+    assert not caught.value.arrived
+    rtde.close()
 
 
 def test_a_program_that_does_not_end_is_told(emulator, settings, capsys):
