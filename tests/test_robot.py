@@ -33,7 +33,7 @@ import model
 import report
 import robot
 from robot import RTDE, Gripper, RobotError, Servo, Settings
-from tests.emulator import START_POSE, Emulator, write_scene
+from tests.emulator import START_POSE, Emulator, turned, write_scene
 from tests.fuzz_robot import fuzz_pose, fuzz_robot, simulated_arm
 
 ROOT = Path(__file__).parents[1]
@@ -324,10 +324,10 @@ def test_rotations_compose_as_scipys_do_near_0_and_near_pi_too():
         for _ in range(20):
             first, second = rng.normal(size=(2, 3))
             first *= size / np.linalg.norm(first)
-            both = robot.rotate(first, second)
             theirs = Rotation.from_rotvec(second) * Rotation.from_rotvec(first)
-            assert (Rotation.from_rotvec(both) * theirs.inv()).magnitude() < 1e-9
-            assert np.linalg.norm(both) < np.pi + 1e-12
+            for both in (robot.rotate(first, second), turned(first, second)):
+                assert (Rotation.from_rotvec(both) * theirs.inv()).magnitude() < 1e-9
+                assert np.linalg.norm(both) < np.pi + 1e-12
 
 
 def test_interpolation_is_straight_and_scipys_slerp():
@@ -1147,6 +1147,8 @@ class Typing:
             for seconds, key in keys:
                 time.sleep(seconds)
                 os.write(writing, f"{key}\n".encode())
+        time.sleep(20)  # an episode that a busy machine has dropped must not be waited for
+        os.close(writing)
 
 
 class Script:
@@ -1268,6 +1270,7 @@ def test_recording_keeps_finished_episodes_and_drops_the_others(
     assert abs(np.diff(state[:, 0])).sum() > 0.01  # the hand did move the arm
     assert action[0, 6] == 0 and action[-1, 6] == 1  # g closed the gripper on the way
     meta = recorded.meta
+    assert meta["positions_in_state"] == 1 and meta["rotation_near_rad"] == [0, 3.14159, 0]
     assert meta["policy_hz"] == 20 and meta["tcp_offset"][2] == 0.17 and meta["payload_kg"] == 1.1
     assert len(meta["time_s"]) == len(meta["points_seen"]) == len(recorded.state)
     assert np.diff(meta["time_s"][: frames.start]).mean() == pytest.approx(0.05, abs=0.01)
