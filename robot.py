@@ -1325,7 +1325,7 @@ def same_tcp(recorded: Any, offset: list[float]) -> bool:
 
 
 def boxes(settings: Settings) -> dict:
-    """The corners of the box of the points, whose middle augmentation turns about, and the TCP's."""
+    """Two corners each: the box of the points, about whose middle augmentation turns, the TCP's."""
     return {
         "workspace": [list(settings.crop_low_m), list(settings.crop_high_m)],
         "tcp_box": [list(settings.tcp_low_m), list(settings.tcp_high_m)],
