@@ -1426,7 +1426,7 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
         context = policy.encode_demo(text.to(args.device), **demo)
 
     def act(frames: list[Frame]) -> np.ndarray | None:
-        if frames[-1].time - frames[0].time >= args.seconds:
+        if not frames[-1].time - frames[0].time < args.seconds:  # NaN seconds, too
             return None
         padded = [frames[0]] * config.n_obs_steps + frames
         observed = padded[-config.n_obs_steps :]  # To frames
@@ -1598,7 +1598,11 @@ class Keys:
 
 
 def record(args: argparse.Namespace, settings: Settings) -> None:
-    """Records demonstrations by hand guidance: the arm is free, keys begin and end an episode."""
+    """Records demonstrations by hand guidance: the arm is free, keys begin and end an episode.
+
+    The keys are those of the terminal. Where standard input is no terminal, they are read from it,
+    as a script or a foot pedal writes them, and its end means q.
+    """
     if not re.fullmatch(data.NAME, args.task):
         raise UserError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
     out = Path(args.out or f"demos/{args.task}.npz")
