@@ -1597,54 +1597,22 @@ class Keys:
         return ""
 
 
-def record(args: argparse.Namespace, settings: Settings) -> None:
-    """Records demonstrations by hand guidance: the arm is free, keys begin and end an episode.
+def finish(frames: list[Frame], grip: list[float], settings: Settings) -> np.ndarray:
+    """Frames (T) and the gripper's commands (T) -> actions (T, 7), each leads to the next frame.
 
-    The keys are those of the terminal. Where standard input is no terminal, they are read from it,
-    as a script or a foot pedal writes them, and its end means q.
+    Raises RobotError for an episode that `run` could not execute.
     """
-    if not re.fullmatch(data.NAME, args.task):
-        raise UserError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
-    out = Path(args.out or f"demos/{args.task}.npz")
-    if out.exists() and not args.append:
-        raise UserError(f"{out} exists: add --append, move it, or give another --out")
-    kept = data.load_demonstrations(out) if out.exists() else None
-    if kept and (kept.task, kept.instruction) != (args.task, args.instruction):
-        raise UserError(f"{out} holds {kept.task}, {kept.instruction!r}: use another --out")
-    if kept and kept.points.shape[1] != settings.num_points:
-        n = kept.points.shape[1]
-        raise UserError(f"{out} has clouds of {n} points: set num_points so, or use another --out")
-    moves = not args.dry_run
-    with common.locked(out.parent), connect(args, settings, write=moves) as cell, Keys() as keys:
-        meta = {**cell.made_with(kept), "made_by": "robot.record", "camera": args.camera}
-        cell.prepare(moves)
-        recorder = Recorder(args=args, cell=cell, out=out, meta=meta, kept=kept)
-        recorder.closed = float(cell.gripper.read() > 0.5)
-        servo = Servo(cell.rtde, settings, moves=moves, free=True, activity=cell.activity)
-        try:
-            servo.start(args.host)
-            print("keys: s starts an episode, e ends and keeps it, d drops it, ", end="")
-            print("g opens or closes the gripper, q quits", flush=True)
-            due = time.monotonic()
-            while recorder.count < args.episodes:
-                key = keys.pressed()
-                if key == "q":
-                    break
-                recorder.press(key, servo)
-                servo.check()
-                recorder.observe()
-                due = max(due + 1 / settings.policy_hz, time.monotonic())
-                time.sleep(max(0.0, due - time.monotonic()))
-            if recorder.frames is not None:
-                print("dropped: the last episode was not ended by e", flush=True)
-        except RobotError as error:
-            kept = recorder.kept
-            before = f"{len(kept)} are in {out}" if kept else "none was kept before"
-            raise RobotError(f"{error}; the episode at hand is dropped, {before}") from error
-        finally:
-            servo.stop()
-    kept = recorder.kept
-    print(f"{len(kept)} episodes in {out}" if kept else "nothing was recorded")
+    poses = [frame.state[:6].astype(float) for frame in frames]
+    settings.check_poses(poses)
+    times = [frame.time for frame in frames]
+    gaps = np.diff(times) if len(times) > 1 else np.zeros(1)  # seconds
+    if gaps.max() > 2 / settings.policy_hz or gaps.mean() > 1.2 / settings.policy_hz:
+        raise RobotError(  # replay would be faster
+            f"frames are {gaps.mean():.2f}, up to {gaps.max():.2f} s apart, camera or gripper were "
+            "late"
+        )
+    moves = [difference(a, b) for a, b in itertools.pairwise(poses)]
+    return np.column_stack([[*moves, np.zeros(6)], grip])
 
 
 @dataclass
@@ -1710,22 +1678,54 @@ class Recorder:
         )
 
 
-def finish(frames: list[Frame], grip: list[float], settings: Settings) -> np.ndarray:
-    """Frames (T) and the gripper's commands (T) -> actions (T, 7), each leads to the next frame.
+def record(args: argparse.Namespace, settings: Settings) -> None:
+    """Records demonstrations by hand guidance: the arm is free, keys begin and end an episode.
 
-    Raises RobotError for an episode that `run` could not execute.
+    The keys are those of the terminal. Where standard input is no terminal, they are read from it,
+    as a script or a foot pedal writes them, and its end means q.
     """
-    poses = [frame.state[:6].astype(float) for frame in frames]
-    settings.check_poses(poses)
-    times = [frame.time for frame in frames]
-    gaps = np.diff(times) if len(times) > 1 else np.zeros(1)  # seconds
-    if gaps.max() > 2 / settings.policy_hz or gaps.mean() > 1.2 / settings.policy_hz:
-        raise RobotError(  # replay would be faster
-            f"frames are {gaps.mean():.2f}, up to {gaps.max():.2f} s apart, camera or gripper were "
-            "late"
-        )
-    moves = [difference(a, b) for a, b in itertools.pairwise(poses)]
-    return np.column_stack([[*moves, np.zeros(6)], grip])
+    if not re.fullmatch(data.NAME, args.task):
+        raise UserError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
+    out = Path(args.out or f"demos/{args.task}.npz")
+    if out.exists() and not args.append:
+        raise UserError(f"{out} exists: add --append, move it, or give another --out")
+    kept = data.load_demonstrations(out) if out.exists() else None
+    if kept and (kept.task, kept.instruction) != (args.task, args.instruction):
+        raise UserError(f"{out} holds {kept.task}, {kept.instruction!r}: use another --out")
+    if kept and kept.points.shape[1] != settings.num_points:
+        n = kept.points.shape[1]
+        raise UserError(f"{out} has clouds of {n} points: set num_points so, or use another --out")
+    moves = not args.dry_run
+    with common.locked(out.parent), connect(args, settings, write=moves) as cell, Keys() as keys:
+        meta = {**cell.made_with(kept), "made_by": "robot.record", "camera": args.camera}
+        cell.prepare(moves)
+        recorder = Recorder(args=args, cell=cell, out=out, meta=meta, kept=kept)
+        recorder.closed = float(cell.gripper.read() > 0.5)
+        servo = Servo(cell.rtde, settings, moves=moves, free=True, activity=cell.activity)
+        try:
+            servo.start(args.host)
+            print("keys: s starts an episode, e ends and keeps it, d drops it, ", end="")
+            print("g opens or closes the gripper, q quits", flush=True)
+            due = time.monotonic()
+            while recorder.count < args.episodes:
+                key = keys.pressed()
+                if key == "q":
+                    break
+                recorder.press(key, servo)
+                servo.check()
+                recorder.observe()
+                due = max(due + 1 / settings.policy_hz, time.monotonic())
+                time.sleep(max(0.0, due - time.monotonic()))
+            if recorder.frames is not None:
+                print("dropped: the last episode was not ended by e", flush=True)
+        except RobotError as error:
+            kept = recorder.kept
+            before = f"{len(kept)} are in {out}" if kept else "none was kept before"
+            raise RobotError(f"{error}; the episode at hand is dropped, {before}") from error
+        finally:
+            servo.stop()
+    kept = recorder.kept
+    print(f"{len(kept)} episodes in {out}" if kept else "nothing was recorded")
 
 
 # ---- Looking at it -------------------------------------------------------------------------------
