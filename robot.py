@@ -916,6 +916,7 @@ class Servo:
     DELAY = 0.025  # seconds from measuring a pose to following the answer
     PATIENCE = 5.0  # seconds for the program to start
     REACHED = 1e-6  # metres and radians from the target: nothing is left to go
+    STANDS = 1e-7  # metres and radians of a step: the slowest arm allowed goes ten times as far
     SLOW = "the policy or the camera is too slow"
 
     def __init__(
@@ -1079,10 +1080,12 @@ class Servo:
                 when, target = self.targets[0]
                 share = min(1.0, dt / max(when - now + dt, dt))
                 goal = compose(self.pose, share * difference(self.pose, target))
-                self.pose = toward(self.pose, goal, self.speed * dt)
+                before = self.pose
+                self.pose = toward(before, goal, self.speed * dt)
                 if when <= now and distance(self.pose, target).max() < self.REACHED:
                     self.targets = []
-                self.held_since = now
+                if when > now or distance(self.pose, before).max() > self.STANDS:
+                    self.held_since = now  # an overdue target, too, while the arm comes nearer
             return self.pose
 
     def stream(self) -> None:

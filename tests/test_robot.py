@@ -374,6 +374,19 @@ def test_a_servo_that_does_not_arrive_is_stopped_and_holds_nothing_for_ever(monk
         assert arm.stopped
 
 
+def test_a_target_that_is_never_reached_does_not_keep_an_arm_from_being_held_too_long(monkeypatch):
+    monkeypatch.setattr(Servo, "REACHED", -1.0)
+    with simulated_arm(Settings(**BOXES, max_hold_s=0.5), np.array(START_POSE)) as arm:
+        arm.servo.follow(steps(dx=0.03, drz=0.02))
+        arm.sleep(1.2)  # 0.8 s, and longer for a step that is faster than the arm may go
+        with pytest.raises(RobotError, match=r"no new actions for 0\.5 s"):
+            arm.sleep(1.5)
+        expected = np.array(START_POSE)
+        for action in steps(dx=0.03, drz=0.02):
+            expected = robot.compose(expected, action)
+        assert robot.distance(arm.pose, expected).max() < 1e-3
+
+
 def test_a_corner_of_the_box_that_was_rounded_to_float32_can_be_gone_to():
     high = np.array([0.2, -0.2, 0.6])
     recorded = np.append(high.astype(np.float32).astype(float), START_POSE[3:])
