@@ -351,7 +351,7 @@ def test_interpolation_is_straight_and_scipys_slerp():
 
 def test_a_tool_that_points_down_arrives_although_its_rotation_vector_may_flip():
     settings = Settings(**BOXES, max_speed_rad_s=2.0, max_lag_rad=0.4)
-    for angle in np.linspace(0, 6, 12):
+    for angle in np.linspace(0, 6, 60)[[0, 3, 13, 33, 47]]:  # where vectors that are compared fail
         down = np.array([-0.2, -0.5, 0.3, np.pi * np.cos(angle), np.pi * np.sin(angle), 0.0])
         start = robot.compose(down, np.array([0.01, 0.0, 0.0, 0.1, -0.1, 0.05]))
         with simulated_arm(settings, start) as arm:
