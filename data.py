@@ -74,14 +74,19 @@ FLOATS = (np.float16, np.float32, np.float64)  # in this machine's byte order
 class Demonstrations:
     """Recorded episodes of one task, one after the other.
 
-    `meta` says how they were made, in values that JSON can hold. Five entries have a meaning here;
+    `meta` says how they were made, in values that JSON can hold. Six entries have a meaning here;
     each may be left out:
 
     - positions_in_state: k, where the first 3 k numbers of a state are k positions x, y, z in the
       frame of the points, and the first three of an action are a change of the first position.
       A pose of seven numbers that begins with x, y, z has 1; joint angles have 0. Only such scenes
-      can be augmented: points, positions and displacement turn by up to 10 degrees together, while
-      an orientation in the state or the action stays as it is, and so is wrong by that much.
+      can be augmented: points, positions and displacement turn by up to 10 degrees together. An
+      orientation in the state or the action turns with them where rotation_near_rad is there;
+      otherwise it stays as it is, and so is wrong by that much.
+    - rotation_near_rad: three numbers, where positions_in_state is 1 and the next three numbers of
+      a state are a rotation vector in the frame of the points, of its two forms the nearer to this
+      one; those of an action are a rotation in that frame, applied after the present one. robot.py
+      records so.
     - success_frames: the frame of each episode's first success, counted from the episode's start.
     - workspace: two opposite corners of the box that holds the points, metres.
     - simulator: the name of the simulator that they were made in; own recordings have none.
@@ -240,6 +245,7 @@ class Demonstrations:
             except (TypeError, ValueError) as error:
                 raise RecordingError(f"meta must hold what JSON can, {name}: {error}") from None
         self.check_positions_in_state(meta)
+        self.check_rotation(meta)
         self.check_success_frames(meta)
         self.check_workspace(meta)
         if "simulator" in meta and not isinstance(meta["simulator"], str):
@@ -259,6 +265,20 @@ class Demonstrations:
             )
         if count and self.action.shape[1] < 3:
             raise RecordingError("with positions_in_state an action must begin with a displacement")
+
+    def check_rotation(self, meta: dict) -> None:
+        near = meta.get("rotation_near_rad")
+        if near is None or meta.get("positions_in_state") != 1:
+            return
+        numbers = isinstance(near, list) and not {type(x) for x in near} - {int, float}
+        if not numbers or len(near) != 3 or not np.isfinite(near).all():
+            raise RecordingError(f"rotation_near_rad is {near!r}: write three numbers, radians")
+        if min(self.state.shape[1], self.action.shape[1]) < 6:
+            raise RecordingError(
+                "with rotation_near_rad states and actions must begin with three numbers of a "
+                f"position and three of a rotation, not have {self.state.shape[1]} and "
+                f"{self.action.shape[1]} numbers"
+            )
 
     def check_success_frames(self, meta: dict) -> None:
         if "success_frames" not in meta:
@@ -613,6 +633,36 @@ def map_positions(x: Tensor, a: Tensor, b: Tensor) -> Tensor:
     return (x.flatten(1, -2) @ a.mT + b).view(x.shape)
 
 
+def nearest_rotations(a: Tensor) -> Tensor:
+    """The rotations (n, 3, 3) nearest to linear maps A (n, 3, 3), by their polar decomposition."""
+    u, _, vh = torch.linalg.svd(a)
+    return u @ vh  # a rotation, since these maps mirror nothing
+
+
+def turn_rotation_vectors(rotvec: Tensor, turn: Tensor, near: Tensor) -> Tensor:
+    """Rotation vectors (n, L, 3), then n further rotations (n, 3, 3) -> rotation vectors (n, L, 3).
+
+    By quaternions (w, x, y, z). Of the two vectors of a rotation, angles v and v - 2 pi, the nearer
+    to `near` (3,) is returned. A turn must be by less than half a turn.
+    """
+    w = (1 + turn.diagonal(dim1=-2, dim2=-1).sum(-1)).sqrt() / 2  # (n,)
+    skew = turn - turn.mT
+    xyz = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=-1) / (4 * w[:, None])
+    aw, a = w[:, None, None], xyz[:, None]  # (n, 1, 1), (n, 1, 3): of the turn
+
+    angle = rotvec.norm(dim=-1, keepdim=True)  # (n, L, 1)
+    bw, b = (angle / 2).cos(), rotvec * (angle / (2 * math.pi)).sinc() / 2  # of the vectors
+
+    w = aw * bw - (a * b).sum(-1, keepdim=True)  # (n, L, 1)
+    xyz = aw * b + bw * a + torch.linalg.cross(a.expand_as(b), b)  # (n, L, 3)
+    sine = xyz.norm(dim=-1, keepdim=True)
+    axis = xyz / sine.clamp_min(1e-12)
+    angle = 2 * torch.atan2(sine, w)  # 0 to 2 pi
+    one, other = axis * angle, axis * (angle - 2 * math.pi)
+    closer = (one - near).norm(dim=-1, keepdim=True) <= (other - near).norm(dim=-1, keepdim=True)
+    return torch.where(closer, one, other)
+
+
 def workspace_center(points: np.ndarray, workspace: Any) -> Tensor:
     """The middle (1, 3) of a workspace's two corners; of the points' own box if that is None."""
     if workspace is None:
@@ -652,8 +702,8 @@ class WindowSampler:
         late_fraction: the share of late windows among those that are drawn. They show how to stay
             where the task is done, and are nearly the same. 0: there are none.
         augment: `batch` moves each scene by an affine map of its own, where the recording says
-            which numbers of a state are positions. Other directions or rotations in the state or
-            the action stay as they are.
+            which numbers of a state are positions. Rotations turn along where it says which they
+            are (`rotation_near_rad`); other directions in the state or the action stay as they are.
 
     Raises RecordingError for demonstrations that do not fit the policy: dimensions, points, length.
     """
@@ -685,6 +735,10 @@ class WindowSampler:
         # For augmentation
         self.positions_in_state = demonstrations.meta.get("positions_in_state", 0)
         self.augment = augment and self.positions_in_state > 0
+        near = demonstrations.meta.get("rotation_near_rad")
+        self.rotation_near: Tensor | None = None  # (3,)
+        if self.positions_in_state == 1 and near is not None:
+            self.rotation_near = torch.tensor(near, dtype=torch.float32, device=device)
         self.center = workspace_center(points, demonstrations.meta.get("workspace"))  # (1, 3)
         largest = float(self.action[:, :3].abs().max())
         self.max_displacement = max(1.0, largest)  # moved actions are clipped to [-1, 1] or more
@@ -820,9 +874,9 @@ class WindowSampler:
         """Moves each scene of n by an affine map of its own.
 
         Points and the positions in a state move together, and the displacement that an action
-        begins with turns and stretches with them: the scene stays one of the same task. Takes and
-        returns points (n, L, N, P), state (n, L, S) and action (n, K, A): L = To and K = H for
-        windows, L = K = T for a demonstration.
+        begins with turns and stretches with them: the scene stays one of the same task. Rotations
+        turn by the rotation nearest to the map. Takes and returns points (n, L, N, P), state
+        (n, L, S) and action (n, K, A): L = To and K = H for windows, L = K = T for a demonstration.
         """
         a, b = sample_affine_maps(len(points), self.center, generator)
         a, b = a.to(points.device), b.to(points.device)
@@ -838,4 +892,11 @@ class WindowSampler:
         limit = self.max_displacement
         displacement = (action[..., :3] @ a.mT).clamp(-limit, limit)  # (n, K, 3)
         action = torch.cat([displacement, action[..., 3:]], dim=-1)
+
+        if self.rotation_near is not None:
+            turn = nearest_rotations(a)  # (n, 3, 3)
+            turned = turn_rotation_vectors(state[..., 3:6], turn, self.rotation_near)  # (n, L, 3)
+            state = torch.cat([state[..., :3], turned, state[..., 6:]], dim=-1)
+            turned = action[..., 3:6] @ turn.mT  # (n, K, 3): its axis turns, its angle stays
+            action = torch.cat([action[..., :3], turned, action[..., 6:]], dim=-1)
         return points, state, action

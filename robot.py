@@ -35,15 +35,15 @@ import struct
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation  # scipy comes with metaworld
 
 import baselines  # noqa: F401  its policies are registered
 import common
@@ -66,24 +66,36 @@ class CameraError(RobotError):
     """No usable cloud: a policy's arm is held, and stopped after `max_hold_s`."""
 
 
+class StaleState(RobotError):
+    """The newest state is too old. `arrived`: newer ones have, but this computer was too busy."""
+
+    def __init__(self, message: str, arrived: bool) -> None:
+        super().__init__(message)
+        self.arrived = arrived
+
+
 # ---- Settings ------------------------------------------------------------------------------------
 
 CORNER = {"shape": (3,), "least": -5.0, "most": 5.0}
+TRANSFORM = {"shape": (4, 4), "least": -5.0, "most": 5.0, "rigid": True}
 PORT = {"least": 1, "most": 65535}
+ROUNDING = 1e-6  # metres: a corner of the box that was written as float32 is still in it
 
 
 @dataclass(frozen=True)
 class Settings:
     """What the JSON file of --config holds, in metres, radians and the robot's base frame.
 
-    The first five have no default: they belong to the place where the arm stands.
+    The first five have no default: they belong to the place where the arm stands. Raises
+    ValueError, in one line, for a value of the wrong type, out of range, or at odds with another.
+    What an arm is to do is checked against them by `check_steps` and `check_poses`.
     """
 
     tcp_low_m: tuple = setting(MISSING, "the box that the TCP stays in", **CORNER)
     tcp_high_m: tuple = setting(MISSING, "its upper corner", **CORNER)
     crop_low_m: tuple = setting(MISSING, "the box that points are kept in", **CORNER)
     crop_high_m: tuple = setting(MISSING, "its upper corner", **CORNER)
-    camera_to_base: tuple = setting(MISSING, "its DEPTH frame", shape=(4, 4), least=-5, most=5)
+    camera_to_base: tuple = setting(MISSING, "its DEPTH frame", **TRANSFORM)
     start_pose: tuple | None = setting(None, "where `run` begins", shape=(6,), least=-6.3, most=6.3)
     outside_box: str = setting("stop", "what to do with such targets", choices=("stop", "clamp"))
     rotation_near_rad: tuple = setting((0, 3.14159, 0), "the nearer of two vectors", **CORNER)
@@ -111,46 +123,97 @@ class Settings:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            if problem := unfit(getattr(self, f.name), f.type, **f.metadata):
-                self.refuse(f.name, problem)
-        for name in ("tcp", "crop"):
-            if not np.less(getattr(self, f"{name}_low_m"), getattr(self, f"{name}_high_m")).all():
-                self.refuse(f"{name}_low_m", f"each number must be below that of {name}_high_m")
-        if problem := no_pose(self.camera_to_base):
-            self.refuse("camera_to_base", problem)
-        for unit in ("m", "rad"):  # at full speed a healthy arm lags by this much
-            lag = getattr(self, f"max_speed_{unit}_s") * self.servo_lookahead_s
-            if lag > 0.9 * getattr(self, f"max_lag_{unit}"):
+            try:
+                check_value(getattr(self, f.name), f.type, **f.metadata)
+            except ValueError as error:
+                self.refuse(f.name, str(error))
+        for box in ("tcp", "crop"):
+            low, high = getattr(self, f"{box}_low_m"), getattr(self, f"{box}_high_m")
+            if not np.less(low, high).all():
+                self.refuse(f"{box}_low_m", f"each number must be below that of {box}_high_m")
+        for unit in ("m", "rad"):
+            speed, allowed = getattr(self, f"max_speed_{unit}_s"), getattr(self, f"max_lag_{unit}")
+            lag = speed * self.servo_lookahead_s  # of a healthy arm at full speed
+            if lag > 0.9 * allowed:
                 why = f"at max_speed_{unit}_s the arm lags by {lag:.3f}: allow more, or be slower"
                 self.refuse(f"max_lag_{unit}", why)
-        if self.start_pose and (reason := refusal([np.array(self.start_pose)], self)):
-            self.refuse("start_pose", reason)
+        if self.start_pose is not None:
+            try:
+                self.check_poses([np.array(self.start_pose, dtype=float)])
+            except RobotError as error:
+                self.refuse("start_pose", str(error))
 
     def refuse(self, name: str, why: str) -> None:
         raise ValueError(f"{name} in the robot's settings is {getattr(self, name)!r}: {why}")
 
+    def check_steps(self, steps: Sequence[np.ndarray]) -> None:
+        """Raises RobotError if one of the steps (6 or 7,) is too far for one of 1 / policy_hz."""
+        for step in steps:
+            metres, radians = lengths(step)
+            if metres > self.max_step_m or radians > self.max_step_rad:
+                raise RobotError(
+                    f"a step jumps by {metres:.3f} m, {radians:.3f} rad (max_step_m, max_step_rad)"
+                )
 
-def unfit(value: Any, kind: str, help="", choices=(), shape=(), least=0.0, most=0.0) -> str | None:
-    """Why a setting of this kind, choices, shape and range cannot have the value; None: it can."""
-    kinds = {"int": {int}, "str": {str}}.get(kind.split(" ")[0], {int, float})
-    numbers, count = np.array(value, dtype=object), " x ".join(map(str, shape)) or 1
+    def check_poses(self, poses: Sequence[np.ndarray]) -> None:
+        """Raises RobotError if the arm must not go through these poses (6,).
+
+        They are 1 / policy_hz apart, and each must be finite and inside the TCP's box.
+        """
+        if not np.isfinite(poses).all():
+            raise RobotError("a pose is not finite")
+        self.check_steps([difference(a, b) for a, b in itertools.pairwise(poses)])
+        for pose in poses:
+            x = pose[:3]
+            outside = np.maximum(self.tcp_low_m - x, x - self.tcp_high_m).max()  # metres
+            if outside > ROUNDING:
+                where = ", ".join(f"{number:.3f}" for number in x)
+                raise RobotError(f"the TCP is outside its box, at {where} m")
+
+
+def check_value(
+    value: Any,
+    kind: str,
+    *,
+    shape: tuple = (),
+    choices: tuple = (),
+    least: float = 0.0,
+    most: float = 0.0,
+    rigid: bool = False,
+    help: str = "",
+) -> None:
+    """Raises ValueError, saying what to write, where a setting cannot have a value.
+
+    Args:
+        value: a number or text, or lists of lists of them.
+        kind: its type as the field of `Settings` has it: "int", "str | None", "tuple" ...
+        shape: of the lists; () is a single value.
+        choices: the values that are possible; (): any.
+        least, most: the range of its numbers.
+        rigid: it is a matrix (4, 4) that moves a rigid body.
+        help: is not used; it belongs to the field, as the others do.
+    """
     if value is None and kind.endswith("None"):
-        return None
-    if numbers.shape != shape or {type(x) for x in numbers.flat} - kinds:
-        return f"give {count} of {' or '.join(sorted(kind.__name__ for kind in kinds))}"
-    if choices or kinds == {str}:
-        return f"use one of {choices}" if choices and value not in choices else None
-    fits = all(least <= x <= most for x in numbers.flat)
-    return None if fits else f"use {least} to {most}; lengths are in metres, angles in radians"
-
-
-def no_pose(matrix: list) -> str | None:
-    """Why a matrix (4, 4) moves no rigid body; None if it does."""
-    pose = np.array(matrix, dtype=float)
-    rigid = np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3)
-    if not rigid or np.linalg.det(pose) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
-        return "its 3 x 3 must be a rotation, its last row 0 0 0 1"
-    return None
+        return
+    types = {"int": {int}, "str": {str}}.get(kind.split(" ")[0], {int, float})
+    array = np.array(value, dtype=object)
+    if array.shape != shape or {type(x) for x in array.flat} - types:
+        count = " x ".join(map(str, shape)) or "1"
+        names = " or ".join(sorted(t.__name__ for t in types))
+        raise ValueError(f"give {count} of {names}")
+    if choices and value not in choices:
+        raise ValueError(f"use one of {choices}")
+    if choices or types == {str}:
+        return
+    if not all(least <= x <= most for x in array.flat):
+        raise ValueError(f"use {least} to {most}; lengths are in metres, angles in radians")
+    if rigid:
+        matrix = array.astype(float)
+        rotation = matrix[:3, :3]
+        orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        mirrored = np.linalg.det(rotation) < 0
+        if not orthogonal or mirrored or matrix[3].tolist() != [0, 0, 0, 1]:
+            raise ValueError("its 3 x 3 must be a rotation, its last row 0 0 0 1")
 
 
 def load_settings(path: str | Path) -> Settings:
@@ -165,23 +228,46 @@ def load_settings(path: str | Path) -> Settings:
 # ---- RTDE: the controller's real-time data exchange ----------------------------------------------
 
 HEADER = struct.Struct(">HB")  # size of the whole package, type
-REQUEST_VERSION, SETUP_OUTPUTS, SETUP_INPUTS, START, DATA, MESSAGE = map(ord, "VOISUM")
+REQUEST_PROTOCOL, REQUEST_CONTROLLER = ord("V"), ord("v")
+SETUP_OUTPUTS, SETUP_INPUTS, START, DATA, MESSAGE = map(ord, "OISUM")
+OLDEST = (5, 5, 1)  # of the controller's software: the first of an e-Series that tells `tcp_offset`
 FORMATS = {"INT32": ">i4", "UINT32": ">u4", "DOUBLE": ">f8", "VECTOR6D": "(6,)>f8"}  # for numpy
-OUTPUTS = tuple(
-    "timestamp actual_TCP_pose tcp_offset payload target_speed_fraction robot_mode safety_mode "
-    "runtime_state robot_status_bits safety_status_bits "
-    "output_int_register_24 "  # the session that our program belongs to
-    "output_int_register_25".split()  # the number of the package that our program followed last
+OUTPUTS = (
+    "timestamp",
+    "actual_TCP_pose",
+    "tcp_offset",
+    "payload",
+    "target_speed_fraction",
+    "robot_mode",
+    "safety_mode",
+    "runtime_state",
+    "robot_status_bits",
+    "safety_status_bits",
+    "output_int_register_24",  # the session that our program belongs to
+    "output_int_register_25",  # the number of the package that our program followed last
 )
 # Registers 0 to 23 belong to the fieldbus. Every package holds its number, the pose to go to, the
 # session's number, or STOP, and its own number again.
 POSE = tuple(f"input_double_register_{24 + i}" for i in range(6))
 INPUTS = ("input_int_register_25", *POSE, "input_int_register_24", "input_int_register_26")
-STOP, RUNNING, PLAYING, PROGRAM_RUNNING = 0, 7, 2, 1 << 1  # robot_mode, runtime_state, status bit
+STOP = 0  # in the place of the session's number: the program ends
+RUNNING = 7  # robot_mode
+PLAYING = 2  # runtime_state
+PROGRAM_RUNNING = 1 << 1  # of robot_status_bits
 STOPPED = 0b111_1111_1100  # of safety_status_bits: all but normal and reduced
-SAFETY = {1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop"}
-SAFETY |= {6: "emergency stop", 7: "emergency stop of the robot", 8: "violation", 9: "fault"}
-SAFETY |= {12: "safeguard stop of automatic mode", 13: "three-position enabling device"}
+SAFETY = {  # safety_mode
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "emergency stop",
+    7: "emergency stop of the robot",
+    8: "violation",
+    9: "fault",
+    12: "safeguard stop of automatic mode",
+    13: "three-position enabling device",
+}
 
 
 class State(NamedTuple):
@@ -195,17 +281,28 @@ class State(NamedTuple):
         """TCP pose (6,), metres and axis-angle, base frame."""
         return self.values["actual_TCP_pose"].astype(float)
 
-    def trouble(self) -> str | None:
-        """Why the arm must not be moved in this state; None if it may."""
+    @property
+    def safety(self) -> str:
+        """The name of the safety mode."""
+        mode = int(self.values["safety_mode"])
+        return SAFETY.get(mode, str(mode))
+
+    def check(self) -> None:
+        """Raises RobotError if the arm must not be moved in this state."""
         v = self.values
         if v["safety_mode"] not in (1, 2) or v["safety_status_bits"] & STOPPED:
-            mode = SAFETY.get(int(v["safety_mode"]), v["safety_mode"])
-            return f"safety: {mode} (status bits {v['safety_status_bits']:#x})"
+            raise RobotError(f"safety: {self.safety} (status bits {v['safety_status_bits']:#x})")
         if v["robot_mode"] != RUNNING:
-            return f"the robot is not running (robot mode {v['robot_mode']}, {RUNNING} is running)"
-        if (slider := v["target_speed_fraction"]) < 0.99:
-            return f"the speed slider is at {slider:.0%}, the arm would stay behind: set it to 100%"
-        return None if np.isfinite(self.pose).all() else "the pose of the TCP is not finite"
+            raise RobotError(
+                f"the robot is not running (robot mode {v['robot_mode']}, {RUNNING} is running)"
+            )
+        slider = v["target_speed_fraction"]
+        if slider < 0.99:
+            raise RobotError(
+                f"the speed slider is at {slider:.0%}, the arm would stay behind: set it to 100%"
+            )
+        if not np.isfinite(self.pose).all():
+            raise RobotError("the pose of the TCP is not finite")
 
 
 class RTDE:
@@ -217,18 +314,38 @@ class RTDE:
     """
 
     def __init__(self, host: str, port: int = 30004, hz: float = 125.0, write: bool = False):
-        self.name, self.said = f"RTDE at {host}:{port}", ""  # the controller's last text message
-        self.buffer, self.newest, self.error, self.stopped = b"", None, None, False
-        self.session, self.number = random.SystemRandom().randrange(1, 2**31), 0
+        self.name = f"RTDE at {host}:{port}"
+        self.controller_said = ""  # the controller's last text message, as an error ends with it
+        self.buffer = b""  # received, and not yet a whole package
+        self.newest: State | None = None
+        self.error: RobotError | None = None  # why the reader's thread has ended
+        self.session = random.SystemRandom().randrange(1, 2**31)
+        self.number = 0  # of the package sent last
         self.rotation: np.ndarray | None = None  # the rotation vector sent last
-        self.lock, self.arrived = threading.Lock(), threading.Condition()
+        self.stopped = False  # the program was told to end: nothing is sent any more
+        self.lock = threading.Lock()  # of what `send` writes
+        self.arrived = threading.Condition()  # a state, or an error
         try:
             self.socket = socket.create_connection((host, port), 2.0)
         except OSError as error:
             raise self.lost(f"cannot be reached: {error}") from None
+        try:
+            self.handshake(hz, write)
+        except BaseException:
+            self.socket.close()
+            raise
+        self.thread = threading.Thread(target=self.read, name="RTDE", daemon=True)
+        self.thread.start()
+
+    def handshake(self, hz: float, write: bool) -> None:
+        """Agrees on protocol and recipes, and starts the states."""
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if self.request(REQUEST_VERSION, struct.pack(">H", 2))[:1] != b"\x01":
+        if self.request(REQUEST_PROTOCOL, struct.pack(">H", 2))[:1] != b"\x01":
             raise self.lost("protocol version 2 is refused: update the controller's software")
+        reply = self.request(REQUEST_CONTROLLER, b"")
+        if len(reply) != 16:
+            raise self.lost(f"framing lost (a controller's version of {len(reply)} bytes)")
+        self.version = struct.unpack(">4I", reply)[:3]  # of the controller's software
         reply = self.request(SETUP_OUTPUTS, struct.pack(">d", hz) + ",".join(OUTPUTS).encode())
         self.output_recipe, self.output_format = self.recipe(reply, OUTPUTS)
         if write:
@@ -236,16 +353,18 @@ class RTDE:
             self.input_recipe, self.input_format = self.recipe(reply, INPUTS)
         if self.request(START, b"")[:1] != b"\x01":
             raise self.lost("it does not start sending")
-        self.thread = threading.Thread(target=self.read, name="RTDE", daemon=True)
-        self.thread.start()
 
     def lost(self, what: str) -> RobotError:
-        return RobotError(f"{self.name}: {what}{self.said}")
+        return RobotError(f"{self.name}: {what}{self.controller_said}")
 
     def recipe(self, reply: bytes, names: Sequence[str]) -> tuple[bytes, np.dtype]:
         """The recipe's id and layout, from the answer to a set-up."""
         types = reply[1:].decode("ascii", "replace").strip(",").split(",")
-        advice = {"IN_USE": "another client holds it", "NOT_FOUND": "not known to the controller"}
+        software = "software {}.{}.{}".format(*self.version)
+        unknown = f"not known to the controller's {software}"
+        if self.version < OLDEST:
+            unknown += ": update it, {}.{}.{} or later is needed".format(*OLDEST)
+        advice = {"IN_USE": "another client holds it", "NOT_FOUND": unknown}
         for name, kind in zip(names, types):
             if kind not in FORMATS:
                 raise self.lost(f"field {name} is {kind} ({advice.get(kind, 'an unknown type')})")
@@ -261,11 +380,13 @@ class RTDE:
                 if size < HEADER.size:
                     raise self.lost(f"framing lost (a package of {size} bytes)")
                 if len(self.buffer) >= size:
-                    payload, self.buffer = self.buffer[HEADER.size : size], self.buffer[size:]
+                    payload = self.buffer[HEADER.size : size]
+                    self.buffer = self.buffer[size:]
                     if kind != MESSAGE:
                         return kind, payload
                     text = payload[1 : 1 + payload[0]] if payload else b""
-                    self.said = f"; the controller said: {text.decode('ascii', 'replace')}"
+                    message = text.decode("ascii", "replace")
+                    self.controller_said = f"; the controller said: {message}"
                     continue
             try:
                 received = self.socket.recv(65536)
@@ -305,14 +426,21 @@ class RTDE:
                 self.arrived.notify_all()
 
     def state(self, max_age: float = 0.1) -> State:
-        """The newest state. RobotError: older than `max_age` seconds, or the connection is lost."""
+        """The newest state.
+
+        Raises StaleState if it is older than `max_age` seconds, RobotError if the connection is
+        lost.
+        """
         with self.arrived:
             self.arrived.wait_for(lambda: self.newest or self.error, 2.0)
         if self.error is not None:
             raise RobotError(str(self.error))
         age = time.monotonic() - self.newest.received if self.newest else math.inf
         if age > max_age:
-            raise self.lost(f"the newest state is {age:.3f} s old")
+            with suppress(OSError, ValueError):  # closed meanwhile
+                arrived = bool(select.select([self.socket], [], [], 0)[0])
+                raise StaleState(str(self.lost(f"the newest state is {age:.3f} s old")), arrived)
+            raise self.lost("connection closed")
         return self.newest
 
     def send(self, pose: np.ndarray, stop: bool = False) -> None:
@@ -320,9 +448,11 @@ class RTDE:
         with self.lock:
             if self.stopped:
                 return
-            self.stopped, self.number = stop, self.number + 1
-            near = pose[3:] if self.rotation is None else self.rotation
-            self.rotation = nearer(pose[3:], near)  # no jump by 2 pi between two packages
+            self.stopped = stop
+            self.number += 1
+            if self.rotation is None:
+                self.rotation = pose[3:]
+            self.rotation = nearer(pose[3:], self.rotation)  # no jump by 2 pi between two packages
             command = STOP if stop else self.session
             inputs = (self.number, *pose[:3], *self.rotation, command, self.number)
             self.transmit(DATA, self.input_recipe + np.array(inputs, self.input_format).tobytes())
@@ -341,6 +471,8 @@ class RTDE:
 
 
 # ---- The controller's program and its other ports ------------------------------------------------
+
+MISSING_PACKAGES = 10  # for which the watchdog waits: 80 ms at 125 Hz
 
 # What runs on the controller. It ends when told to, when RTDE is late (the watchdog, so that no arm
 # moves or stays free whose computer is gone), or when no inverse kinematics is found. The session
@@ -368,18 +500,25 @@ PROGRAM = """def dami():
   write_output_integer_register(24, 0)
 end
 """
-SERVO = "servoj(get_inverse_kin(pose, get_actual_joint_positions()), t={:.4f}, "
-SERVO += "lookahead_time={:.3f}, gain={:.0f})"
+SERVO = (
+    "servoj(get_inverse_kin(pose, get_actual_joint_positions()), t={period:.4f}, "
+    "lookahead_time={lookahead:.3f}, gain={gain:.0f})"
+)
 
 
 def program(session: int, settings: Settings, free: bool) -> str:
     """The URScript program of a session, which moves the arm or sets it free."""
-    servo = SERVO.format(1 / settings.servo_hz, settings.servo_lookahead_s, settings.servo_gain)
-    parts = ("freedrive_mode", "sync()", "end_freedrive_mode") if free else ("sync", servo, "sync")
-    parts = dict(zip(("before", "turn", "after"), parts))
-    registers = ", ".join(f"read_input_float_register({24 + i})" for i in range(6))
-    watchdog_hz = settings.servo_hz / 10  # 80 ms at 125 Hz
-    return PROGRAM.format(session=session, registers=registers, watchdog_hz=watchdog_hz, **parts)
+    servo = SERVO.format(
+        period=1 / settings.servo_hz, lookahead=settings.servo_lookahead_s, gain=settings.servo_gain
+    )
+    return PROGRAM.format(
+        session=session,
+        watchdog_hz=settings.servo_hz / MISSING_PACKAGES,
+        registers=", ".join(f"read_input_float_register({24 + i})" for i in range(6)),
+        before="freedrive_mode" if free else "sync",
+        turn="sync()" if free else servo,
+        after="end_freedrive_mode" if free else "sync",
+    )
 
 
 @contextmanager
@@ -399,16 +538,18 @@ def upload(host: str, port: int, text: str, waiting: Callable = lambda: None) ->
     """
     with port_of(host, port, "the script port") as connection:
         connection.sendall(text.encode())
-        received, deadline = 0, time.monotonic() + 2
+        deadline = time.monotonic() + 2
+        received = 0  # bytes
         while received < 79:  # one that closes without having read may have its program discarded
             waiting()
             if not select.select([connection], [], [], 0.01)[0]:
                 if time.monotonic() > deadline:
                     raise OSError("it says nothing")
                 continue
-            received += len(part := connection.recv(4096))
+            part = connection.recv(4096)
             if not part:
                 raise OSError("it closed the connection")
+            received += len(part)
 
 
 def dashboard(host: str, port: int, *questions: str) -> dict[str, str]:
@@ -445,7 +586,8 @@ class Bridge:
     def __init__(self, host: str, port: int, timeout: float) -> None:
         self.connection = socket.create_connection((host, port), 2.0)
         self.connection.settimeout(timeout)
-        self.write, self.close = self.connection.sendall, self.connection.close
+        self.write = self.connection.sendall
+        self.close = self.connection.close
 
     def read(self, n: int) -> bytes:
         received = b""
@@ -465,7 +607,9 @@ class Gripper:
     RETRIES = 3  # of a time-out, a bad check sum, an exception; then RobotError
 
     def __init__(self, settings: Settings, host: str, timeout: float = 0.3) -> None:
-        self.settings, self.timeout, self.commanded = settings, timeout, None
+        self.settings = settings
+        self.timeout = timeout  # seconds
+        self.commanded: int | None = None  # the position written last, per mille
         self.where = settings.gripper_serial or f"{host}:{settings.gripper_port}"
         try:
             if settings.gripper_serial:
@@ -521,8 +665,10 @@ class Gripper:
 
     def move(self, closed: float) -> None:
         """Goes to 0 (open) ... 1 (closed); nothing is sent for a change below 1 %."""
-        shut, full = 1000 - self.settings.gripper_open_at, min(1.0, max(0.0, closed))
-        position = round(full * shut + (1 - full) * self.settings.gripper_open_at)
+        open_at = self.settings.gripper_open_at
+        closed_at = 1000 - open_at
+        share = min(1.0, max(0.0, closed))
+        position = round(share * closed_at + (1 - share) * open_at)
         if self.commanded is None or abs(position - self.commanded) >= 10:
             self.exchange(WRITE, POSITION, position)
             self.commanded = position
@@ -582,7 +728,8 @@ class RealSense:
             import pyrealsense2 as rs
         except ImportError:
             raise UserError("`pip install pyrealsense2`, or name a recorded --camera") from None
-        self.pipeline, config = rs.pipeline(), rs.config()
+        self.pipeline = rs.pipeline()
+        config = rs.config()
         config.enable_stream(rs.stream.depth, width, height, rs.format.z16, hz)
         try:
             profile = self.pipeline.start(config)
@@ -617,7 +764,8 @@ class RecordedCamera:
     def __init__(self, path: str | Path) -> None:
         try:
             with np.load(path, allow_pickle=False) as file:
-                depth, self.intrinsics = file["depth"], tuple(map(float, file["intrinsics"]))
+                depth = file["depth"]
+                self.intrinsics = tuple(map(float, file["intrinsics"]))
             if depth.ndim != 3 or not depth.size or depth.dtype != np.uint16:
                 raise TypeError(f"depth is {depth.dtype} {depth.shape}")
             if len(self.intrinsics) != 4:
@@ -625,26 +773,89 @@ class RecordedCamera:
         except Exception as error:  # numpy and zipfile raise many types
             what = "no recorded camera: depth (F, H, W) uint16, intrinsics (4,) in an .npz file"
             raise UserError(f"{path} is {what} ({error})") from None
-        self.images, self.close = itertools.cycle(depth), lambda: None
+        self.images = itertools.cycle(depth)
+
+    def close(self) -> None:
+        """There is nothing to close: the file has been read."""
 
     def read(self) -> np.ndarray:
         """The next depth image (H, W) float32 in metres."""
         return next(self.images).astype(np.float32) / 1000
 
 
+# ---- What keeps this computer busy ---------------------------------------------------------------
+
+
+WRITING = "writing the recording"
+
+
+class Activity:
+    """What the main thread is at, and was: what to blame when the servo's thread runs late."""
+
+    def __init__(self) -> None:
+        self.current: tuple[str, float] | None = None  # name, began
+        self.ended: deque[tuple[str, float, float]] = deque(maxlen=32)  # name, began, ended
+
+    @contextmanager
+    def during(self, name: str) -> Iterator[None]:
+        """Inside, the main thread is at this."""
+        began = time.monotonic()
+        self.current = (name, began)
+        try:
+            yield
+        finally:
+            self.ended.append((name, began, time.monotonic()))
+            self.current = None
+
+    def longest(self, since: float, now: float) -> tuple[str, float]:
+        """What took longest between two times, and how many seconds of them."""
+        took = {"waiting": 0.0}
+        current = self.current
+        running = [(*current, now)] if current else []
+        for name, began, ended in [*self.ended, *running]:
+            took[name] = took.get(name, 0.0) + max(0.0, min(ended, now) - max(began, since))
+        return max(took.items(), key=lambda item: item[1])
+
+
 # ---- Streaming motion ----------------------------------------------------------------------------
+
+
+def quaternion(rotvec: Sequence[float]) -> tuple[float, float, float, float]:
+    """The unit quaternion (w, x, y, z) of a rotation vector (3,)."""
+    x, y, z = rotvec
+    angle = math.sqrt(x * x + y * y + z * z)
+    scale = math.sin(angle / 2) / angle if angle > 1e-9 else 0.5
+    return math.cos(angle / 2), scale * x, scale * y, scale * z
+
+
+def rotate(rotvec: Sequence[float], turn: Sequence[float]) -> np.ndarray:
+    """The rotation vector (3,) of one rotation, then another; its angle is at most pi.
+
+    Plain numbers, and not an array library: the servo's thread does this ten times in 8 ms, and it
+    takes five microseconds, in which it keeps Python's lock from all others.
+    """
+    aw, ax, ay, az = quaternion(turn)
+    bw, bx, by, bz = quaternion(rotvec)
+    w = aw * bw - ax * bx - ay * by - az * bz
+    x = aw * bx + bw * ax + ay * bz - az * by
+    y = aw * by + bw * ay + az * bx - ax * bz
+    z = aw * bz + bw * az + ax * by - ay * bx
+    sine = math.sqrt(x * x + y * y + z * z)
+    angle = 2 * math.atan2(sine, abs(w))
+    scale = math.copysign(angle / sine if sine > 1e-9 else 2.0, w)
+    return np.array([scale * x, scale * y, scale * z])
 
 
 def compose(pose: np.ndarray, action: np.ndarray) -> np.ndarray:
     """Pose (6,) and relative action (>= 6,) -> the pose (6,) it leads to."""
-    rotation = Rotation.from_rotvec(action[3:6]) * Rotation.from_rotvec(pose[3:])
-    return np.concatenate([pose[:3] + action[:3], rotation.as_rotvec()])
+    rotvec = rotate(pose[3:].tolist(), action[3:6].tolist())
+    return np.concatenate([pose[:3] + action[:3], rotvec])
 
 
 def difference(pose: np.ndarray, later: np.ndarray) -> np.ndarray:
     """The action (6,) that leads from one pose to a later one; the inverse of `compose`."""
-    rotation = Rotation.from_rotvec(later[3:]) * Rotation.from_rotvec(pose[3:]).inv()
-    return np.concatenate([later[:3] - pose[:3], rotation.as_rotvec()])
+    turn = rotate((-pose[3:]).tolist(), later[3:].tolist())
+    return np.concatenate([later[:3] - pose[:3], turn])
 
 
 def nearer(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -662,28 +873,19 @@ def lengths(steps: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.reshape(steps[..., :6], (*steps.shape[:-1], 2, 3)), axis=-1)
 
 
+def distance(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """How far two poses (6,) are apart: metres and radians (2,).
+
+    Poses are compared by this alone. Their six numbers may differ by a whole turn where the poses
+    are the same, since a rotation by nearly pi, as of a tool that points down, has two vectors.
+    """
+    return lengths(difference(pose, other))
+
+
 def toward(pose: np.ndarray, target: np.ndarray, most: np.ndarray) -> np.ndarray:
     """From pose to target (6,), by no more than (metres, radians): straight, and on SO(3)."""
     step = difference(pose, target)
     return compose(pose, step * np.repeat(np.minimum(1, most / lengths(step).clip(1e-12)), 3))
-
-
-def jump(steps: Sequence[np.ndarray], settings: Settings) -> str | None:
-    """Which of these steps (6 or 7,) is too far for one of 1 / policy_hz; None if none is."""
-    for metres, radians in map(lengths, steps):
-        if metres > settings.max_step_m or radians > settings.max_step_rad:
-            return f"a step jumps by {metres:.3f} m, {radians:.3f} rad (max_step_m, max_step_rad)"
-    return None
-
-
-def refusal(poses: Sequence[np.ndarray], settings: Settings) -> str | None:
-    """Why an arm must not go through these poses (6,), one every 1 / policy_hz; None if it may."""
-    if reason := jump([difference(*pair) for pair in itertools.pairwise(poses)], settings):
-        return reason
-    for x in (pose[:3] for pose in poses):
-        if ((x < settings.tcp_low_m) | (x > settings.tcp_high_m)).any():
-            return f"the TCP is outside its box, at {', '.join(f'{i:.3f}' for i in x)} m"
-    return None
 
 
 def warn(text: str) -> None:
@@ -713,44 +915,80 @@ class Servo:
 
     DELAY = 0.025  # seconds from measuring a pose to following the answer
     PATIENCE = 5.0  # seconds for the program to start
+    REACHED = 1e-6  # metres and radians from the target: nothing is left to go
+    STANDS = 1e-7  # metres and radians of a step: the slowest arm allowed goes ten times as far
     SLOW = "the policy or the camera is too slow"
 
-    def __init__(self, rtde: RTDE, settings: Settings, moves: bool = True, free: bool = False):
-        self.rtde, self.settings, self.moves, self.free = rtde, settings, moves, free
+    def __init__(
+        self,
+        rtde: RTDE,
+        settings: Settings,
+        moves: bool = True,
+        free: bool = False,
+        activity: Activity | None = None,
+    ) -> None:
+        self.rtde = rtde
+        self.settings = settings
+        self.moves = moves  # False: a dry run
+        self.free = free
+        self.activity = activity or Activity()
+
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
         self.sent = self.pose  # sent last: not farther ahead of the arm than `lead`
-        most, ahead = (settings.max_speed_m_s, settings.max_speed_rad_s), settings.servo_lookahead_s
-        self.lead = np.array(most) * ahead  # (2,) metres, radians
-        self.speed = self.lead / (ahead + self.DELAY)  # (2,) a second, of the targets
+        fastest = np.array([settings.max_speed_m_s, settings.max_speed_rad_s])
+        lookahead = settings.servo_lookahead_s
+        self.lead = fastest * lookahead  # (2,) metres, radians
+        self.speed = self.lead / (lookahead + self.DELAY)  # (2,) a second, of the targets
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
         self.broken_off = False  # targets were left out
+        self.held_since = time.monotonic()
         self.missing = self.SLOW  # why the arm holds
-        self.lock, self.error, self.ended = threading.Lock(), None, threading.Event()
+
+        self.lock = threading.Lock()  # of the targets
+        self.error: str | None = None  # why the arm was stopped
+        self.ended = threading.Event()
         self.changed: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
-        self.lateness, self.ages, self.clamped, self.slowed, self.delay = [], [], 0, 0, math.inf
+        self.delay = math.inf  # of the promptest state, and a constant
+        self.last_step = (time.monotonic(), time.process_time())  # when, and computed until then
+        self.stall = ""  # why the stream stood still for so long that the watchdog may have struck
+        self.stalled_at = -math.inf
+
+        self.lateness: list[float] = []  # seconds, of each package
+        self.ages: list[float] = []  # seconds, of the state that each package answers
+        self.clamped = 0  # targets
+        self.slowed = 0  # actions
         self.thread = threading.Thread(target=self.stream, name="servo", daemon=True)
 
     def start(self, host: str) -> None:
         """Starts the program on the controller where the arm now is, and begins to stream."""
-        settings, deadline = self.settings, time.monotonic() + self.PATIENCE
-        for turn in itertools.count():
+        settings = self.settings
+        deadline = time.monotonic() + self.PATIENCE
+        uploaded = False
+        while True:
             state = self.rtde.state(settings.max_state_age_s)
             self.pose = state.pose  # not an older one: the arm may have been moved meanwhile
-            reason = state.trouble() or (None if self.free else refusal([self.pose], settings))
-            if time.monotonic() > deadline:
-                reason = reason or f"its program does not start: remote control?{self.rtde.said}"
-            if reason:
-                raise RobotError(f"the arm is not moved: {reason}")
-            if not self.moves or self.rtde.program_runs(state):
-                break
-            if turn == 0 and state.values["robot_status_bits"] & PROGRAM_RUNNING:
-                raise RobotError("the arm is not moved: another program runs there, stop it first")
+            try:
+                state.check()
+                if not self.free:
+                    settings.check_poses([self.pose])
+                if time.monotonic() > deadline:
+                    raise RobotError(
+                        f"its program does not start: remote control?{self.rtde.controller_said}"
+                    )
+                if not self.moves or self.rtde.program_runs(state):
+                    break
+                if not uploaded and state.values["robot_status_bits"] & PROGRAM_RUNNING:
+                    raise RobotError("another program runs there, stop it first")
+            except RobotError as error:
+                raise RobotError(f"the arm is not moved: {error}") from None
             self.send(self.pose)
-            if turn == 0:
+            if not uploaded:
                 text = program(self.rtde.session, settings, self.free)
-                upload(host, settings.script_port, text, lambda: self.send(self.pose))
+                upload(host, settings.script_port, text, waiting=lambda: self.send(self.pose))
+                uploaded = True
             time.sleep(1 / settings.servo_hz)
         self.held_since = time.monotonic()
+        self.last_step = (self.held_since, time.process_time())
         self.thread.start()
 
     def send(self, pose: np.ndarray) -> None:
@@ -759,48 +997,78 @@ class Servo:
 
     def follow(self, actions: np.ndarray) -> None:
         """Takes relative actions (n, 7), one every 1 / policy_hz from now on, or stops the arm."""
-        actions, settings = np.asarray(actions, dtype=float), self.settings
-        if actions.shape != (len(actions), ACTION_DIM) or len(actions) == 0:
-            self.fail(f"actions have the shape {actions.shape}, not (n, {ACTION_DIM})")
-        elif not np.isfinite(actions).all():
-            self.fail("an action is not finite")
-        elif reason := jump(actions, settings):  # as asked: clamped to the box, it may be none
-            self.fail(reason)
-        self.check()
-        with self.lock:
-            poses, now = [self.pose], time.monotonic()
+        actions = np.asarray(actions, dtype=float)
+        with self.stopping(), self.lock:
+            if actions.shape != (len(actions), ACTION_DIM) or len(actions) == 0:
+                raise RobotError(f"actions have the shape {actions.shape}, not (n, {ACTION_DIM})")
+            if not np.isfinite(actions).all():
+                raise RobotError("an action is not finite")
+            self.settings.check_steps(actions)  # as asked: clamped to the box, none may be a jump
+            poses = [self.pose]
             for action in actions:
-                pose = compose(poses[-1], action)
-                if settings.outside_box == "clamp":
-                    asked = pose[:3].copy()
-                    pose[:3] = asked.clip(settings.tcp_low_m, settings.tcp_high_m)
-                    self.clamped += not np.array_equal(pose[:3], asked)
-                poses.append(pose)
-            if reason := refusal(poses, settings):
-                self.fail(reason)
-            when = now + np.arange(1, len(poses)) / settings.policy_hz
-            self.targets, self.broken_off = list(zip(when, poses[1:])), False
+                poses.append(self.into_box(compose(poses[-1], action)))
+            self.settings.check_poses(poses)
+            when = time.monotonic() + np.arange(1, len(poses)) / self.settings.policy_hz
+            self.targets = list(zip(when, poses[1:]))
+            self.broken_off = False
         self.slowed += self.too_fast(actions)
+
+    @contextmanager
+    def stopping(self) -> Iterator[None]:
+        """Inside, an error stops the arm before it is raised; if it was stopped, that is raised."""
+        self.check()
+        try:
+            yield
+        except RobotError as error:
+            self.fail(str(error))
         self.check()
 
     def hold(self) -> None:
         """Leaves out the targets that are left: what comes next follows from where the arm is."""
         with self.lock:
-            self.broken_off, self.targets = self.broken_off or bool(self.targets), []
+            self.broken_off = self.broken_off or bool(self.targets)
+            self.targets = []
 
     def too_fast(self, actions: np.ndarray) -> int:
         """How many actions (n, 7) ask for more than the speed allowed: they are cut short."""
         return int((lengths(actions) * self.settings.policy_hz > self.speed).any(axis=1).sum())
 
     def go(self, pose: np.ndarray) -> None:
-        """Goes straight to a pose (6,) at a quarter of the speed allowed; returns when there."""
-        step, settings = difference(self.pose, pose), self.settings
-        n = math.ceil((lengths(step) / self.speed).max() * 4 * settings.policy_hz) or 1
-        self.follow(np.tile(np.append(step / n, 0.0), (n, 1)))
-        behind = 3 * settings.servo_lookahead_s
-        while self.targets or time.monotonic() < self.held_since + behind:
-            self.check()
+        """Goes straight to a pose (6,) at a quarter of the speed allowed; returns when there.
+
+        The line is divided into targets that are 0.1 s apart, whatever `policy_hz` and `max_step_m`
+        say of a policy's steps. The last of them is repeated until an arm that lags by servoj's
+        lookahead time has arrived, too. The box is convex: with both ends the line lies in it.
+        """
+        with self.stopping(), self.lock:
+            start = self.pose
+            pose = self.into_box(pose)
+            for end in (start, pose):
+                self.settings.check_poses([end])
+            step = difference(start, pose)
+            seconds = 4 * float((lengths(step) / self.speed).max())
+            n = max(1, math.ceil(seconds / 0.1))
+            now = time.monotonic()
+            self.targets = [
+                (now + seconds * i / n, compose(start, step * i / n)) for i in range(1, n + 1)
+            ]
+            arrived = now + seconds + 3 * self.settings.servo_lookahead_s
+            self.targets.append((arrived, self.targets[-1][1]))
+            self.broken_off = False
+        while self.targets:
+            with self.stopping():
+                if time.monotonic() > arrived + 1.0:
+                    raise RobotError("the pose that the arm was sent to is not reached")
             time.sleep(0.01)
+        self.check()
+
+    def into_box(self, pose: np.ndarray) -> np.ndarray:
+        """The pose (6,), or with `outside_box` "clamp" the nearest one inside the box."""
+        if self.settings.outside_box != "clamp":
+            return pose
+        inside = pose[:3].clip(self.settings.tcp_low_m, self.settings.tcp_high_m)
+        self.clamped += bool(abs(inside - pose[:3]).max() > ROUNDING)
+        return np.concatenate([inside, pose[3:]])
 
     def tick(self, now: float) -> np.ndarray:
         """The pose to command now: toward the next target, on time, no faster than allowed."""
@@ -812,59 +1080,116 @@ class Servo:
                 when, target = self.targets[0]
                 share = min(1.0, dt / max(when - now + dt, dt))
                 goal = compose(self.pose, share * difference(self.pose, target))
-                self.pose = toward(self.pose, goal, self.speed * dt)
-                if when <= now and np.allclose(self.pose, target, atol=1e-6):
+                before = self.pose
+                self.pose = toward(before, goal, self.speed * dt)
+                if when <= now and distance(self.pose, target).max() < self.REACHED:
                     self.targets = []
-                self.held_since = now
+                if when > now or distance(self.pose, before).max() > self.STANDS:
+                    self.held_since = now  # an overdue target, too, while the arm comes nearer
             return self.pose
 
     def stream(self) -> None:
         """The thread: a package every 1 / servo_hz, until something is wrong or `stop` comes."""
-        period, due = 1 / self.settings.servo_hz, time.monotonic()
+        period = 1 / self.settings.servo_hz
+        due = time.monotonic()
         try:
             while not self.ended.is_set() and self.error is None:
-                state, now = self.rtde.state(self.settings.max_state_age_s), time.monotonic()
-                if reason := self.trouble(state, now):
-                    return self.fail(reason)
-                pose = state.pose if self.free else self.tick(now)
-                if self.moves:
-                    self.send(toward(state.pose, pose, self.lead))
+                now = time.monotonic()
                 self.lateness.append(now - due)
-                self.ages.append(now - state.received)
+                self.step()
                 due = max(due + period, now - period)  # no burst to catch up after a pause
                 time.sleep(max(0.0, due - time.monotonic()))
+        except RobotError as error:
+            self.fail(str(error))
         except Exception as error:  # whatever it is: without this thread the arm must not go on
-            known = isinstance(error, RobotError)
-            self.fail(str(error) if known else f"the stream broke off: {error!r}")
+            self.fail(f"the stream broke off: {error!r}")
 
-    def trouble(self, state: State, now: float) -> str | None:
-        """Why the arm must stop in this state; None if it need not."""
-        settings, v = self.settings, state.values
-        if reason := state.trouble():
-            return reason
-        delay = now - v["timestamp"]  # and a constant; clocks may drift apart by a thousandth
-        self.delay = min(self.delay + 1e-3 / settings.servo_hz, delay)
-        watched = {"the controller's clock": v["timestamp"]}
+    def step(self) -> None:
+        """One package: the pose to command now, if the newest state allows it."""
+        settings = self.settings
+        try:
+            state = self.rtde.state(settings.max_state_age_s)
+        except StaleState as error:
+            if error.arrived:
+                reason = f", but newer ones have arrived{self.describe_stall()}"
+            else:
+                reason = ", and no newer one has arrived: look for the network or the controller"
+            raise RobotError(f"{error}{reason}") from error
+        now = time.monotonic()
+        if now - self.last_step[0] > MISSING_PACKAGES / settings.servo_hz:
+            self.stall = self.describe_stall()
+            self.stalled_at = now
+        self.check_state(state, now)
+        self.last_step = (now, time.process_time())
+        pose = state.pose if self.free else self.tick(now)
+        if self.moves:
+            self.send(toward(state.pose, pose, self.lead))
+        self.ages.append(now - state.received)
+
+    def describe_stall(self) -> str:
+        """With what this computer was busy since the last step of the stream.
+
+        A thread of this program that computes in a library may keep Python's lock, so that no other
+        thread runs; then the program has used a processor meanwhile. If it has not, it waited for
+        the disk, or other programs had the processors.
+        """
+        before, computed_before = self.last_step
+        now = time.monotonic()
+        computed = time.process_time() - computed_before
+        name, seconds = self.activity.longest(before, now)
+        if computed > 0.5 * (now - before):
+            culprit = "it kept Python's lock, or all processors"
+        elif name == WRITING:
+            culprit = "the disk is slow"
+        else:
+            culprit = "other programs had the processors"
+        return (
+            f"; this computer was busy. For {now - before:.3f} s the stream stood still, in which "
+            f"this program computed for {computed:.3f} s and was longest at {name}, "
+            f"{seconds:.3f} s: {culprit}"
+        )
+
+    def check_state(self, state: State, now: float) -> None:
+        """Raises RobotError if the arm must stop in this state, at this time."""
+        state.check()
+        self.check_progress(state, now)
+        if self.free:
+            return
+        settings = self.settings
+        metres, radians = distance(state.pose, self.pose)
+        if self.moves and (metres > settings.max_lag_m or radians > settings.max_lag_rad):
+            raise RobotError(
+                f"the arm is {metres:.3f} m, {radians:.3f} rad behind: blocked, or slowed down"
+            )
+        if now - self.held_since > settings.max_hold_s:
+            raise RobotError(f"no new actions for {settings.max_hold_s:g} s: {self.missing}")
+
+    def check_progress(self, state: State, now: float) -> None:
+        """Raises RobotError if controller or program do not go on, or states come later."""
+        max_age = self.settings.max_state_age_s
+        values = state.values
+        delay = now - values["timestamp"]  # and a constant
+        # Clocks may drift apart by a thousandth.
+        self.delay = min(self.delay + 1e-3 / self.settings.servo_hz, delay)
+        watched = {"the controller's clock": values["timestamp"]}
         if self.moves:
             if not self.rtde.program_runs(state):
-                return f"the program on the controller has ended, or is paused{self.rtde.said}"
-            watched["our program"] = v["output_int_register_25"]
+                stall = self.stall if now - self.stalled_at < 1 else ""  # the watchdog ended it
+                raise RobotError(
+                    "the program on the controller has ended, or is paused"
+                    f"{self.rtde.controller_said}{stall}"
+                )
+            watched["our program"] = values["output_int_register_25"]
         for name, value in watched.items():
             old, since = self.changed.get(name, (value, now))
-            if value < old or now - since > 2 * settings.max_state_age_s:
-                return f"{name} {'runs backwards' if value < old else 'stands still'}"
+            if value < old:
+                raise RobotError(f"{name} runs backwards")
+            if now - since > 2 * max_age:
+                raise RobotError(f"{name} stands still")
             self.changed[name] = (value, now if value > old else since)
         ticks = self.changed["the controller's clock"][1] == now
-        if ticks and delay - self.delay > settings.max_state_age_s:
-            return f"states arrive {delay - self.delay:.3f} s later than at first"
-        if self.free:
-            return None
-        metres, radians = lengths(difference(state.pose, self.pose))
-        if self.moves and (metres > settings.max_lag_m or radians > settings.max_lag_rad):
-            return f"the arm is {metres:.3f} m, {radians:.3f} rad behind: blocked, or slowed down"
-        if now - self.held_since > settings.max_hold_s:
-            return f"no new actions for {settings.max_hold_s:g} s: {self.missing}"
-        return None
+        if ticks and delay - self.delay > max_age:
+            raise RobotError(f"states arrive {delay - self.delay:.3f} s later than at first")
 
     def check(self) -> None:
         """Raises RobotError if the arm was stopped."""
@@ -882,7 +1207,8 @@ class Servo:
         """Ends the stream and the program on the controller, and says if that goes on."""
         self.ended.set()
         self.fail("stopped")
-        deadline, age = time.monotonic() + 1, self.settings.max_state_age_s
+        age = self.settings.max_state_age_s
+        deadline = time.monotonic() + 1
         with suppress(RobotError):  # a lost connection says nothing about the program
             while self.moves and self.rtde.program_runs(self.rtde.state(age)):
                 if time.monotonic() > deadline:
@@ -894,12 +1220,18 @@ class Servo:
         if self.clamped:
             warn(f"{self.clamped} targets lay outside the box and were clamped")
         if self.slowed:
-            v, w = self.speed
-            warn(f"{self.slowed} actions were faster than {v:.2f} m/s, {w:.2f} rad/s: cut short")
-        late, age = 1000 * np.array(self.lateness or [0.0]), 1000 * max(self.ages, default=0.0)
-        often = f"{len(self.lateness)} packages at {self.settings.servo_hz:g} Hz: late by "
-        often += "{:.2f} ms (median), {:.2f} ms (99 %), ".format(*np.percentile(late, (50, 99)))
-        return f"{often}{late.max():.2f} ms (worst); oldest state {age:.1f} ms"
+            metres, radians = self.speed
+            warn(
+                f"{self.slowed} actions were faster than {metres:.2f} m/s, {radians:.2f} rad/s: "
+                "cut short"
+            )
+        late = 1000 * np.array(self.lateness or [0.0])  # milliseconds
+        oldest = 1000 * max(self.ages, default=0.0)
+        return (
+            f"{len(self.lateness)} packages at {self.settings.servo_hz:g} Hz: late by "
+            f"{np.percentile(late, 50):.2f} ms (median), {np.percentile(late, 99):.2f} ms (99 %), "
+            f"{late.max():.2f} ms (worst); oldest state {oldest:.1f} ms"
+        )
 
 
 # ---- What is seen, and its file ------------------------------------------------------------------
@@ -922,6 +1254,7 @@ class Cell:
     rtde: RTDE
     gripper: Gripper
     camera: RealSense | RecordedCamera
+    activity: Activity
 
     def observe(self, servo: Servo | None = None) -> Frame:
         """The present observation; while there is none `servo` holds the arm, until it stops it.
@@ -930,7 +1263,10 @@ class Cell:
         """
         while True:
             try:
-                points, seen = cloud(self.camera.read(), self.camera.intrinsics, self.settings)
+                with self.activity.during("reading the camera"):
+                    depth = self.camera.read()
+                with self.activity.during("sampling the cloud"):
+                    points, seen = cloud(depth, self.camera.intrinsics, self.settings)
                 break
             except CameraError as error:
                 if servo is None:
@@ -943,36 +1279,60 @@ class Cell:
             servo.missing = Servo.SLOW
         pose = self.rtde.state(self.settings.max_state_age_s).pose
         pose[3:] = nearer(pose[3:], np.array(self.settings.rotation_near_rad))
-        state = np.append(pose, self.gripper.read()).astype(np.float32)
+        with self.activity.during("reading the gripper"):
+            closed = self.gripper.read()
+        state = np.append(pose, closed).astype(np.float32)
         return Frame(time.monotonic(), points, seen, state)
 
     def prepare(self, moves: bool) -> None:
         """Camera, gripper and arm must answer before anything moves; then readies the gripper."""
         self.observe()
-        if reason := self.rtde.state(self.settings.max_state_age_s).trouble():
-            raise RobotError(f"the arm is not moved: {reason}")
+        try:
+            self.rtde.state(self.settings.max_state_age_s).check()
+        except RobotError as error:
+            raise RobotError(f"the arm is not moved: {error}") from None
         if moves:
             self.gripper.initialize()
 
     def made_with(self, recording: Demonstrations | None = None) -> dict:
         """What recordings tell of the robot. UserError for one that was made with another."""
-        v, settings = self.rtde.state(self.settings.max_state_age_s).values, self.settings
-        now = {"policy_hz": float(settings.policy_hz), "payload_kg": round(float(v["payload"]), 3)}
-        now["tcp_offset"] = v["tcp_offset"].round(4).tolist()
-        now["rotation_near_rad"] = list(map(float, settings.rotation_near_rad))
-        now["gripper_open_at"] = settings.gripper_open_at
-        now["workspace"] = boxes(settings)["workspace"]
+        settings = self.settings
+        values = self.rtde.state(settings.max_state_age_s).values
+        now = {
+            "policy_hz": float(settings.policy_hz),
+            "payload_kg": round(float(values["payload"]), 3),
+            "tcp_offset": values["tcp_offset"].round(4).tolist(),
+            "rotation_near_rad": [float(x) for x in settings.rotation_near_rad],
+            "gripper_open_at": settings.gripper_open_at,
+            "workspace": boxes(settings)["workspace"],
+        }
         for name, value in now.items():
-            if recording and (found := recording.meta.get(name)) != value:
-                made = f"{recording.task} was recorded with {name} {found}"
-                raise UserError(f"{made}, now it is {value}: set it as it was, or record again")
-        return now | boxes(settings)
+            recorded = recording.meta.get(name) if recording else value
+            if name == "tcp_offset" and same_tcp(recorded, value):
+                continue
+            if recorded != value:
+                raise UserError(
+                    f"{recording.task} was recorded with {name} {recorded}, now it is {value}: "
+                    "set it as it was, or record again"
+                )
+        return {**now, **boxes(settings), "positions_in_state": 1}
+
+
+def same_tcp(recorded: Any, offset: list[float]) -> bool:
+    """Whether two offsets of the TCP are the same pose, to 0.2 mm and 0.2 mrad."""
+    if not isinstance(recorded, list) or {type(x) for x in recorded} - {int, float}:
+        return False
+    if len(recorded) != 6:
+        return False
+    return bool(distance(np.array(recorded), np.array(offset)).max() < 2e-4)
 
 
 def boxes(settings: Settings) -> dict:
-    """What pictures of recordings draw, and augmentation turns about."""
-    crop = [list(settings.crop_low_m), list(settings.crop_high_m)]
-    return {"workspace": crop, "tcp_box": [list(settings.tcp_low_m), list(settings.tcp_high_m)]}
+    """Two corners each: the box of the points, about whose middle augmentation turns, the TCP's."""
+    return {
+        "workspace": [list(settings.crop_low_m), list(settings.crop_high_m)],
+        "tcp_box": [list(settings.tcp_low_m), list(settings.tcp_high_m)],
+    }
 
 
 @contextmanager
@@ -983,28 +1343,51 @@ def connect(args: argparse.Namespace, settings: Settings, write: bool) -> Iterat
     with ExitStack() as stack:
         camera = RecordedCamera(args.camera) if args.camera else RealSense()
         stack.callback(camera.close)
-        stack.callback((gripper := Gripper(settings, args.host)).close)
+        gripper = Gripper(settings, args.host)
+        stack.callback(gripper.close)
         rtde = RTDE(args.host, settings.rtde_port, settings.servo_hz, write)
         stack.callback(rtde.close)
-        yield Cell(settings, rtde, gripper, camera)
+        yield Cell(
+            settings=settings, rtde=rtde, gripper=gripper, camera=camera, activity=Activity()
+        )
 
 
-def to_recording(about: tuple, frames: list[Frame], actions: Any, to: Any = None) -> Demonstrations:
-    """An episode of frames (T) and actions (T, 7), behind those of another recording.
+def to_recording(
+    frames: list[Frame],
+    actions: Any,
+    *,
+    task: str,
+    instruction: str,
+    meta: dict,
+    earlier: Demonstrations | None = None,
+) -> Demonstrations:
+    """An episode of frames (T) and actions (T, 7), behind those of an earlier recording.
 
-    About it: task, instruction and meta, to which the frames' times, in seconds, are added.
+    The times of the frames, in seconds, and how many points they were sampled from are added to
+    `meta`.
     """
-    task, instruction, meta = about
-    lists = {"time_s": [round(frame.time - frames[0].time, 4) for frame in frames]}
-    lists["points_seen"] = [frame.seen for frame in frames]
-    points = np.stack([frame.points for frame in frames]).astype(np.float16)
-    arrays = {"points": points, "state": np.stack([frame.state for frame in frames])}
-    arrays["action"], ends = np.array(actions, np.float32), np.array([len(frames)])
-    if to is not None:
-        arrays = {part: np.concatenate([getattr(to, part), new]) for part, new in arrays.items()}
-        ends = np.append(to.episode_ends, to.episode_ends[-1] + ends)
-        lists = {name: [*to.meta.get(name, []), *new] for name, new in lists.items()}
-    return Demonstrations(task, instruction, **arrays, episode_ends=ends, meta=meta | lists)
+    times = [round(frame.time - frames[0].time, 4) for frame in frames]
+    points_seen = [frame.seen for frame in frames]
+    points = np.stack([frame.points for frame in frames]).astype(np.float16)  # (T, N, 3)
+    state = np.stack([frame.state for frame in frames])  # (T, 7)
+    action = np.array(actions, np.float32)  # (T, 7)
+    episode_ends = np.array([len(frames)])
+    if earlier is not None:
+        times = [*earlier.meta.get("time_s", []), *times]
+        points_seen = [*earlier.meta.get("points_seen", []), *points_seen]
+        points = np.concatenate([earlier.points, points])
+        state = np.concatenate([earlier.state, state])
+        action = np.concatenate([earlier.action, action])
+        episode_ends = np.append(earlier.episode_ends, len(state))
+    return Demonstrations(
+        task=task,
+        instruction=instruction,
+        points=points,
+        state=state,
+        action=action,
+        episode_ends=episode_ends,
+        meta={**meta, "time_s": times, "points_seen": points_seen},
+    )
 
 
 def save(out: Path, recording: Demonstrations) -> Demonstrations:
@@ -1023,13 +1406,17 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
     """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and again."""
     common.pick_device(args.device)
     policy, info = model.load(args.checkpoint, args.device, needs=("text_weights",))
-    config, mine = policy.config, (STATE_DIM, ACTION_DIM, settings.num_points)
+    config = policy.config
     needed = (config.state_dim, config.action_dim, config.num_points)
-    if needed[:2] != mine[:2] or needed[2] > mine[2]:
-        what = f"{args.checkpoint} has {needed} dimensions of state and action, and points"
-        raise UserError(f"{what}, the robot {mine}: use a policy trained on its recordings")
+    if needed[:2] != (STATE_DIM, ACTION_DIM) or config.num_points > settings.num_points:
+        raise UserError(
+            f"{args.checkpoint} has {needed} dimensions of state and action, and points, the robot "
+            f"{(STATE_DIM, ACTION_DIM, settings.num_points)}: use a policy trained on its "
+            "recordings"
+        )
     recording = data.load_demonstrations(args.data)
-    if (task := info.get("adapted_to", recording.task)) != recording.task:
+    task = info.get("adapted_to", recording.task)
+    if task != recording.task:
         raise UserError(f"{args.checkpoint} was adapted to {task}, {args.data} is of another task")
     sampler = data.WindowSampler(recording, config, device=args.device)
     text, _ = text_features([recording.instruction], args.clip_weights, info["text_weights"])
@@ -1042,19 +1429,21 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
         context = policy.encode_demo(text.to(args.device), **demo)
 
     def act(frames: list[Frame]) -> np.ndarray | None:
-        if not frames[-1].time - frames[0].time < args.seconds:
+        if not frames[-1].time - frames[0].time < args.seconds:  # NaN seconds, too
             return None
-        last = ([frames[0]] * config.n_obs_steps + frames)[-config.n_obs_steps :]
-        points = torch.tensor(np.stack([frame.points for frame in last]))[None]
+        padded = [frames[0]] * config.n_obs_steps + frames
+        observed = padded[-config.n_obs_steps :]  # To frames
+        points = torch.tensor(np.stack([frame.points for frame in observed]))[None]
         points = points[:, :, : config.num_points].to(args.device)  # (1, To, N, 3)
-        state = torch.tensor(np.stack([frame.state for frame in last]))[None].to(args.device)
+        state = torch.tensor(np.stack([frame.state for frame in observed]))[None]
+        state = state.to(args.device)  # (1, To, S)
         try:
             actions = policy.sample_actions(points, state, context, generator)  # (1, Ta, A)
         except Exception as error:
             raise RobotError(f"the policy failed: {error!r}") from error
         return actions[0].cpu().numpy()
 
-    drive(args, settings, recording, act, settings.start_pose)
+    drive(args, settings, recording, act=act, start=settings.start_pose)
 
 
 def replay(args: argparse.Namespace, settings: Settings) -> None:
@@ -1069,10 +1458,45 @@ def replay(args: argparse.Namespace, settings: Settings) -> None:
     actions = recording.action[frames]  # (T, A)
     chunks = iter(np.array_split(actions, math.ceil(len(actions) / 8)))
     start = recording.state[frames.start, :6].tolist()
-    drive(args, settings, recording, lambda _: next(chunks, None), start)
+    drive(args, settings, recording, act=lambda _: next(chunks, None), start=start)
 
 
-def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callable, start: Any):
+@dataclass
+class Log:
+    """What was seen and done, as it is written when it ends."""
+
+    frames: list[Frame] = field(default_factory=list)
+    actions: list[np.ndarray] = field(default_factory=list)  # (7,)
+    commanded: list[list[float]] = field(default_factory=list)  # the pose (6,) before each action
+    ended: str = "done"  # or the reason
+
+    def write(self, out: Path, recording: Demonstrations, meta: dict) -> None:
+        """Writes whole steps, a frame and its action, in the format of recordings."""
+        count = min(len(self.frames), len(self.actions))
+        if count == 0:
+            return
+        done = to_recording(
+            self.frames[:count],
+            self.actions[:count],
+            task=recording.task,
+            instruction=recording.instruction,
+            meta={**meta, "commanded": self.commanded, "ended": self.ended},
+        )
+        try:
+            save(out, done)
+            print(f"wrote {out}")
+        except (UserError, RecordingError) as error:
+            warn(str(error))
+
+
+def drive(
+    args: argparse.Namespace,
+    settings: Settings,
+    recording: Demonstrations,
+    *,
+    act: Callable[[list[Frame]], np.ndarray | None],
+    start: Sequence[float] | None,
+) -> None:
     """Executes the chunks (Ta, 7) with which `act` answers all frames seen, until it says None.
 
     If camera or gripper are late, or fail, what is left of a chunk is left out. Frames and actions
@@ -1082,90 +1506,187 @@ def drive(args: Any, settings: Settings, recording: Demonstrations, act: Callabl
     out = Path(args.out or f"runs/robot/{name}")
     if out.exists():
         raise UserError(f"{out} exists: move it, or give another --out")
-    ended, frames, actions, commanded = "done", [], [], []
+    log = Log()
     with connect(args, settings, write=not args.dry_run) as cell:
-        meta = cell.made_with(recording) | {"made_by": f"robot.{args.command}"}
-        servo = Servo(cell.rtde, settings, moves=not args.dry_run)
+        meta = {**cell.made_with(recording), "made_by": f"robot.{args.command}"}
+        servo = Servo(cell.rtde, settings, moves=not args.dry_run, activity=cell.activity)
         try:
             cell.prepare(servo.moves)
             servo.start(args.host)
             if start is not None:
                 servo.go(np.array(start))
             print(f"{recording.task}: {args.command}; Ctrl-C stops", flush=True)
-            frames.append(cell.observe(servo))
-            while (chunk := act(frames)) is not None:
-                servo.follow(chunk)
-                began = time.monotonic()
-                for step, action in enumerate(chunk, start=1):
-                    actions.append(action)
-                    commanded.append(servo.pose.tolist())
-                    servo.check()
-                    if servo.moves:
-                        cell.gripper.move(action[6])
-                    while (left := began + step / settings.policy_hz - time.monotonic()) > 0:
-                        servo.check()
-                        time.sleep(min(left, 0.02))
-                    servo.check()
-                    frames.append(cell.observe(servo))
-                    behind = time.monotonic() - began - step / settings.policy_hz
-                    if step < len(chunk) and behind > 1 / settings.policy_hz:
-                        servo.hold()  # the gripper must act where the arm was to be then
-                    if servo.broken_off and args.command == "replay":
-                        raise RobotError(
-                            "camera or gripper were late: the rest would begin elsewhere"
-                        )
-                    if servo.broken_off:
-                        break
+            log.frames.append(cell.observe(servo))
+            while True:
+                with cell.activity.during("computing actions"):
+                    chunk = act(log.frames)
+                if chunk is None:
+                    break
+                execute(chunk, cell, servo, log)
+                if servo.broken_off and args.command == "replay":
+                    raise RobotError("camera or gripper were late: the rest would begin elsewhere")
         except BaseException as error:  # Ctrl-C, too
-            ended = str(error) or type(error).__name__
+            log.ended = str(error) or type(error).__name__
             raise
         finally:
             servo.stop()
-            meta |= {"commanded": commanded, "ended": ended}
-            about = (recording.task, recording.instruction, meta)
-            if count := min(len(frames), len(actions)):
-                try:
-                    save(out, to_recording(about, frames[:count], actions[:count]))
-                    print(f"wrote {out}")
-                except (UserError, RecordingError) as error:
-                    warn(str(error))
+            log.write(out, recording, meta)
             print(servo.report())
+
+
+def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
+    """Executes the actions (Ta, 7) of a chunk, and logs them and what is seen after each."""
+    period = 1 / servo.settings.policy_hz
+    servo.follow(chunk)
+    began = time.monotonic()
+    for step, action in enumerate(chunk, start=1):
+        log.actions.append(action)
+        log.commanded.append(servo.pose.tolist())
+        servo.check()
+        if servo.moves:
+            with cell.activity.during("moving the gripper"):
+                cell.gripper.move(action[6])
+        due = began + step * period
+        while time.monotonic() < due:
+            servo.check()
+            time.sleep(max(0.0, min(due - time.monotonic(), 0.02)))
+        servo.check()
+        log.frames.append(cell.observe(servo))
+        late = time.monotonic() - due
+        if step < len(chunk) and late > period:
+            servo.hold()  # the gripper must act where the arm was to be then
+        if servo.broken_off:
+            return
 
 
 # ---- Recording -----------------------------------------------------------------------------------
 
 
 class Keys:
-    """The keys pressed so far, one at a time, without waiting: of a terminal, or of stdin."""
+    """The keys pressed so far, one at a time, without waiting.
+
+    They are those of the terminal, where no Enter is needed. Where standard input is no terminal,
+    they are what a script, or the driver of a foot pedal, writes into it; its end means `q`.
+    """
 
     def __enter__(self) -> Keys:
-        import termios  # Windows has neither
-        import tty
+        if sys.stdin is None or sys.stdin.closed:
+            raise UserError("standard input is closed: use a terminal, or write the keys into it")
+        self.terminal = sys.stdin.isatty()
+        if self.terminal:
+            import termios  # Windows has neither
+            import tty
 
-        self.old = termios.tcgetattr(sys.stdin) if sys.stdin.isatty() else None
-        if self.old is not None:
-            tty.setcbreak(sys.stdin)  # no Enter is needed
+            self.attributes = termios.tcgetattr(sys.stdin)
+            tty.setcbreak(sys.stdin)
         return self
 
     def __exit__(self, *_: Any) -> None:
-        import termios
+        if self.terminal:
+            import termios
 
-        if self.old is not None:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self.old)
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self.attributes)
 
     def pressed(self) -> str:
-        """One key, or an empty string. Raises RobotError at the end of the input."""
+        """One key, or an empty string. Raises RobotError where the terminal is gone."""
         while select.select([sys.stdin], [], [], 0)[0]:
             key = os.read(sys.stdin.fileno(), 1).decode("ascii", "replace")  # unbuffered
+            if key == "" and self.terminal:
+                raise RobotError("the terminal is gone")
             if key == "":
-                raise RobotError("the input has ended")
-            if key != "\n":
-                return key
+                return "q"
+            if not key.isspace():
+                return key.lower()
         return ""
 
 
+def finish(frames: list[Frame], grip: list[float], settings: Settings) -> np.ndarray:
+    """Frames (T) and the gripper's commands (T) -> actions (T, 7), each leads to the next frame.
+
+    Raises RobotError for an episode that `run` could not execute.
+    """
+    poses = [frame.state[:6].astype(float) for frame in frames]
+    settings.check_poses(poses)
+    times = [frame.time for frame in frames]
+    gaps = np.diff(times) if len(times) > 1 else np.zeros(1)  # seconds
+    if gaps.max() > 2 / settings.policy_hz or gaps.mean() > 1.2 / settings.policy_hz:
+        raise RobotError(  # replay would be faster
+            f"frames are {gaps.mean():.2f}, up to {gaps.max():.2f} s apart, camera or gripper were "
+            "late"
+        )
+    moves = [difference(a, b) for a, b in itertools.pairwise(poses)]
+    return np.column_stack([[*moves, np.zeros(6)], grip])
+
+
+@dataclass
+class Recorder:
+    """The episode at hand, and those that are kept."""
+
+    args: argparse.Namespace
+    cell: Cell
+    out: Path
+    meta: dict
+    kept: Demonstrations | None  # all episodes of the file
+    count: int = 0  # episodes kept since the start
+    closed: float = 0.0  # what the gripper was told: 1 closed
+    frames: list[Frame] | None = None  # of the episode at hand; None: there is none
+    grip: list[float] = field(default_factory=list)  # the gripper's command at each frame
+
+    def press(self, key: str, servo: Servo) -> None:
+        """Does what a key asks for."""
+        if key == "g":
+            self.closed = 1.0 - self.closed
+            servo.check()
+            if servo.moves:
+                with self.cell.activity.during("moving the gripper"):
+                    self.cell.gripper.move(self.closed)
+        elif key == "s" and self.frames is None:
+            self.frames, self.grip = [], []
+            print(f"episode {self.count + 1}: recording", flush=True)
+        elif key == "d" and self.frames is not None:
+            self.frames = None
+            print("dropped", flush=True)
+        elif key == "e" and self.frames:
+            self.keep(servo)
+            self.frames = None
+
+    def observe(self) -> None:
+        """Adds what is seen now to the episode at hand."""
+        if self.frames is not None:
+            self.frames.append(self.cell.observe())
+            self.grip.append(self.closed)
+
+    def keep(self, servo: Servo) -> None:
+        """Writes the episode at hand behind the others, if `run` could execute it."""
+        try:
+            actions = finish(self.frames, self.grip, self.cell.settings)
+        except RobotError as error:
+            print(f"dropped: {error}", flush=True)
+            return
+        with self.cell.activity.during(WRITING):
+            recording = to_recording(
+                self.frames,
+                actions,
+                task=self.args.task,
+                instruction=self.args.instruction,
+                meta=self.meta,
+                earlier=self.kept,
+            )
+            self.kept = save(self.out, recording)
+        self.count += 1
+        print(
+            f"episode {self.count}: {len(self.frames)} frames, {servo.too_fast(actions)} of them "
+            f"faster than the arm may go; saved in {self.out}",
+            flush=True,
+        )
+
+
 def record(args: argparse.Namespace, settings: Settings) -> None:
-    """Records demonstrations by hand guidance: the arm is free, keys begin and end an episode."""
+    """Records demonstrations by hand guidance: the arm is free, keys begin and end an episode.
+
+    The keys are those of the terminal. Where standard input is no terminal, they are read from it,
+    as a script or a foot pedal writes them, and its end means q.
+    """
     if not re.fullmatch(data.NAME, args.task):
         raise UserError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
     out = Path(args.out or f"demos/{args.task}.npz")
@@ -1174,67 +1695,40 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
     kept = data.load_demonstrations(out) if out.exists() else None
     if kept and (kept.task, kept.instruction) != (args.task, args.instruction):
         raise UserError(f"{out} holds {kept.task}, {kept.instruction!r}: use another --out")
-    if kept and (n := kept.points.shape[1]) != settings.num_points:
+    if kept and kept.points.shape[1] != settings.num_points:
+        n = kept.points.shape[1]
         raise UserError(f"{out} has clouds of {n} points: set num_points so, or use another --out")
-    moves, count, due, frames, grip = not args.dry_run, 0, time.monotonic(), None, []
+    moves = not args.dry_run
     with common.locked(out.parent), connect(args, settings, write=moves) as cell, Keys() as keys:
-        meta = cell.made_with(kept) | {"made_by": "robot.record", "camera": args.camera}
+        meta = {**cell.made_with(kept), "made_by": "robot.record", "camera": args.camera}
         cell.prepare(moves)
-        closed = float(cell.gripper.read() > 0.5)
-        servo = Servo(cell.rtde, settings, moves, free=True)
+        recorder = Recorder(args=args, cell=cell, out=out, meta=meta, kept=kept)
+        recorder.closed = float(cell.gripper.read() > 0.5)
+        servo = Servo(cell.rtde, settings, moves=moves, free=True, activity=cell.activity)
         try:
             servo.start(args.host)
-            print("keys: s starts an episode, e ends and keeps it, d drops it", end=", ")
+            print("keys: s starts an episode, e ends and keeps it, d drops it, ", end="")
             print("g opens or closes the gripper, q quits", flush=True)
-            while count < args.episodes and (key := keys.pressed()) != "q":
-                if key == "g":
-                    closed = 1.0 - closed
-                    servo.check()
-                    if moves:
-                        cell.gripper.move(closed)
-                elif key == "s" and frames is None:
-                    frames, grip = [], []
-                    print(f"episode {count + 1}: recording", flush=True)
-                elif key == "d" and frames is not None:
-                    frames = None
-                    print("dropped", flush=True)
-                elif key == "e" and frames:
-                    actions, problem = finish(frames, grip, settings)
-                    if problem is None:
-                        about = (args.task, args.instruction, meta)
-                        kept = save(out, to_recording(about, frames, actions, kept))
-                        count += 1
-                        fast = f"{servo.too_fast(actions)} of them faster than the arm may go"
-                        problem = f"episode {count}: {len(frames)} frames, {fast}; saved in {out}"
-                    frames = None
-                    print(problem, flush=True)
+            due = time.monotonic()
+            while recorder.count < args.episodes:
+                key = keys.pressed()
+                if key == "q":
+                    break
+                recorder.press(key, servo)
                 servo.check()
-                if frames is not None:
-                    frames.append(cell.observe())
-                    grip.append(closed)
+                recorder.observe()
                 due = max(due + 1 / settings.policy_hz, time.monotonic())
                 time.sleep(max(0.0, due - time.monotonic()))
+            if recorder.frames is not None:
+                print("dropped: the last episode was not ended by e", flush=True)
         except RobotError as error:
+            kept = recorder.kept
             before = f"{len(kept)} are in {out}" if kept else "none was kept before"
             raise RobotError(f"{error}; the episode at hand is dropped, {before}") from error
         finally:
             servo.stop()
+    kept = recorder.kept
     print(f"{len(kept)} episodes in {out}" if kept else "nothing was recorded")
-
-
-def finish(frames: list[Frame], grip: list[float], settings: Settings) -> tuple[Any, str | None]:
-    """Frames, the gripper's commands -> actions (T, 7), each leads to the next frame.
-
-    And why the episode is not kept, if `run` could not execute it.
-    """
-    poses = [frame.state[:6].astype(float) for frame in frames]
-    moves = [difference(*pair) for pair in itertools.pairwise(poses)] + [np.zeros(6)]
-    problem, times = refusal(poses, settings), [frame.time for frame in frames]
-    gaps = np.diff(times) if times[1:] else np.zeros(1)
-    if gaps.max() > 2 / settings.policy_hz or gaps.mean() > 1.2 / settings.policy_hz:
-        apart = f"{gaps.mean():.2f}, up to {gaps.max():.2f} s apart"  # replay would be faster
-        problem = f"frames are {apart}, camera or gripper were late"
-    return np.column_stack([moves, grip]), problem and f"dropped: {problem}"
 
 
 # ---- Looking at it -------------------------------------------------------------------------------
@@ -1243,46 +1737,70 @@ def finish(frames: list[Frame], grip: list[float], settings: Settings) -> tuple[
 def check(args: argparse.Namespace, settings: Settings) -> None:
     """Connects to everything, moves nothing, and says what it found."""
     asked = ("robotmode", "safetystatus", "programState", "is in remote control")
-    answers = dashboard(args.host, settings.dashboard_port, *asked)
+    try:
+        answers = dashboard(args.host, settings.dashboard_port, *asked)
+    except RobotError as error:  # nothing but `check` needs it
+        answers = {
+            "dashboard": f"none ({error}): PolyScope X has none, elsewhere enable it",
+            "is in remote control": "unknown: look at the panel",
+        }
     with connect(args, settings, write=False) as cell:
         state = cell.rtde.state(settings.max_state_age_s)
-        trouble = state.trouble() or refusal([state.pose], settings)
-        if answers["is in remote control"] == "false":
-            trouble = trouble or "it is not in remote control: switch that at the panel"
-        depth, meta = cell.camera.read(), cell.made_with()
+        trouble = None
+        try:
+            state.check()
+            settings.check_poses([state.pose])
+            if answers["is in remote control"] == "false":
+                raise RobotError("it is not in remote control: switch that at the panel")
+        except RobotError as error:
+            trouble = str(error)
+        depth = cell.camera.read()
         points, kept = to_base(depth, cell.camera.intrinsics, settings)
         low, high = kept.min(0).round(3), kept.max(0).round(3)
-        ready = cell.gripper.exchange(READ, INITIALIZED, 1)
-        rows = answers | {
+        version = ".".join(map(str, cell.rtde.version))
+        gripper_state = cell.gripper.exchange(READ, INITIALIZED, 1)
+        meta = cell.made_with()
+        rows = {
+            **answers,
+            "controller": f"software {version}, robot mode {state.values['robot_mode']}, "
+            f"safety {state.safety}",
             "TCP, m and rad": " ".join(f"{x:.3f}" for x in state.pose),
             "state": trouble or "ready",
-            "recorded with": cell.made_with(),
-            "gripper": f"{cell.gripper.read():.2f} (0 open, 1 closed), state {ready}",
+            "recorded with": meta,
+            "gripper": f"{cell.gripper.read():.2f} (0 open, 1 closed), state {gripper_state}",
             "depth": f"in {(depth > 0).mean():.0%} of {depth.shape[1]} x {depth.shape[0]} pixels",
             "points": f"{len(kept)} of {len(points)} in the crop box, {low} to {high} m",
         }
     for name, value in rows.items():
         print(f"{name:22}{value}")
     if args.picture:
-        some = points[:: math.ceil(len(points) / SAMPLED_FROM)]
-        frame = Frame(0.0, some, len(kept), np.append(state.pose, 0.0))
-        about = ("check", "the robot's base frame", meta | {"positions_in_state": 1})
-        report.plot_demonstration(to_recording(about, [frame], np.zeros((1, 7))), args.picture)
+        sampled = points[:: math.ceil(len(points) / SAMPLED_FROM)]
+        frame = Frame(0.0, sampled, len(kept), np.append(state.pose, 0.0))
+        seen = to_recording(
+            [frame],
+            np.zeros((1, ACTION_DIM)),
+            task="check",
+            instruction="the robot's base frame",
+            meta={**meta, "positions_in_state": 1},
+        )
+        report.plot_demonstration(seen, args.picture)
         print(f"wrote {args.picture}")
     if trouble:
         raise RobotError(f"the arm cannot be moved: {trouble}")
 
 
-def record_camera(args: argparse.Namespace, _: Any = None) -> None:
+def record_camera(args: argparse.Namespace) -> None:
     """Records depth images to a file that --camera replays."""
     camera = RecordedCamera(args.camera) if args.camera else RealSense()
     try:
         depth = np.stack([camera.read() for _ in range(max(1, args.frames))])  # (F, H, W) metres
     finally:
         camera.close()
-    arrays = {"depth": (1000 * depth).round().clip(0, 65535).astype(np.uint16)}
-    arrays["intrinsics"] = np.array(camera.intrinsics)
-    data.write_atomically(args.out, lambda path: np.savez_compressed(path, **arrays))
+    millimetres = (1000 * depth).round().clip(0, 65535).astype(np.uint16)
+    intrinsics = np.array(camera.intrinsics)
+    data.write_atomically(
+        args.out, lambda path: np.savez_compressed(path, depth=millimetres, intrinsics=intrinsics)
+    )
     print(f"wrote {args.out}: {len(depth)} images of {depth.shape[2]} x {depth.shape[1]} pixels")
 
 
@@ -1330,7 +1848,10 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    COMMANDS[args.command](args, *([load_settings(args.config)] if "config" in args else []))
+    if args.command == "camera":
+        record_camera(args)
+    else:
+        COMMANDS[args.command](args, load_settings(args.config))
 
 
 if __name__ == "__main__":

@@ -462,6 +462,8 @@ def fingerprint(samplers: dict[str, WindowSampler]) -> str:
         sha.update(f"{sampler.task} {sampler.instruction}".encode())
         if sampler.augment:
             sha.update(f"{sampler.positions_in_state} {sampler.center.tolist()}".encode())
+            if sampler.rotation_near is not None:
+                sha.update(f"{sampler.rotation_near.tolist()}".encode())
         for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
             sha.update(part.cpu().numpy().tobytes())
     return sha.hexdigest()

@@ -25,7 +25,6 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 TYPES = {
     "timestamp": "DOUBLE",
@@ -66,6 +65,7 @@ class Faults:
     """What goes wrong; set at any time."""
 
     refuse_version: bool = False
+    version: tuple = (5, 15, 0)  # of the controller's software; 10 is PolyScope X
     not_found: set[str] = field(default_factory=set)
     in_use: set[str] = field(default_factory=set)
     silent: bool = False  # no more data packages: the state grows stale
@@ -193,9 +193,8 @@ class Emulator:
         else:
             step = dt * math.exp(-dt / BRAKE_SECONDS) * np.array(self.speed)
         if step.any():
-            turned = Rotation.from_rotvec(step[3:]) * Rotation.from_rotvec(before[3:])
-            rotvec = turned.as_rotvec() if step[3:].any() else before[3:]
-            self.pose = [*(np.array(before[:3]) + step[:3]).tolist(), *map(float, rotvec)]
+            rotvec = turned(before[3:], step[3:]) if step[3:].any() else before[3:]
+            self.pose = [*(np.array(before[:3]) + step[:3]).tolist(), *rotvec]
         self.speed = (step / dt).tolist()
         if not self.free:
             for part in (0, 1):
@@ -408,7 +407,7 @@ class Emulator:
             if kind == "V":
                 send("V", bytes([payload == b"\0\2" and not self.faults.refuse_version]))
             elif kind == "v":
-                send("v", struct.pack(">IIII", 5, 15, 0, 0))
+                send("v", struct.pack(">IIII", *self.faults.version, 0))
             elif kind == "O":
                 (frequency,) = struct.unpack_from(">d", payload)
                 fields, kinds = set_up(payload[8:], TYPES)
@@ -568,8 +567,29 @@ def write_scene(path, frames: int = 20) -> None:
 
 def pose_difference(pose, target) -> np.ndarray:
     """The step (6,) in metres and radians from one pose to another."""
-    turn = Rotation.from_rotvec(target[3:]) * Rotation.from_rotvec(pose[3:]).inv()
-    return np.concatenate([np.subtract(target[:3], pose[:3]), turn.as_rotvec()])
+    turn = turned([-x for x in pose[3:]], target[3:])
+    return np.array([b - a for a, b in zip(pose[:3], target[:3])] + turn)
+
+
+def turned(rotvec, by) -> list[float]:
+    """A rotation vector, turned by another: half angles are added on the sphere.
+
+    In plain numbers: 500 times a second, in a process that is busy with what is tested.
+    """
+    halves = []
+    for vector in (rotvec, by):
+        angle = math.hypot(*vector)
+        axis = [float(x) / angle for x in vector] if angle else [0.0, 0.0, 0.0]
+        halves.append((math.cos(angle / 2), [math.sin(angle / 2) * x for x in axis]))
+    (cos_a, a), (cos_b, b) = halves
+    cos = cos_a * cos_b - sum(x * y for x, y in zip(a, b))
+    cross = [b[1] * a[2] - b[2] * a[1], b[2] * a[0] - b[0] * a[2], b[0] * a[1] - b[1] * a[0]]
+    sin = [cos_a * y + cos_b * x + z for x, y, z in zip(a, b, cross)]
+    length = math.hypot(*sin)
+    if length == 0.0:
+        return [0.0, 0.0, 0.0]
+    angle = 2 * math.atan2(length, cos)
+    return [x / length * (angle if angle <= math.pi else angle - 2 * math.pi) for x in sin]
 
 
 def modbus_crc(data: bytes) -> bytes:

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 import data
 from data import Demonstrations, RecordingError, WindowSampler
@@ -674,6 +675,74 @@ def test_scenes_are_moved_elsewhere_and_stay_consistent():
     recorded.action[:] *= 100  # in another unit: 50 at most, and so after each map
     asked = WindowSampler(recorded, SIZES, augment=True).batch(12, seeded())["action"]
     assert 49 < asked[..., :3].abs().max() <= 50
+
+
+def arm_recording(near=(0.0, np.pi, 0.0)):
+    """Demonstrations as robot.py records them: a tool that points down, and turns at each step."""
+    rng = np.random.default_rng(0)
+    steps = rng.normal(size=(30, 6)) * 0.02
+    poses = [np.array([0.1, 0.6, 0.2, 0.0, np.pi - 0.05, 0.0])]
+    for step in steps[:-1]:
+        before = Rotation.from_rotvec(poses[-1][3:])
+        rotvec = (Rotation.from_rotvec(step[3:]) * before).as_rotvec()
+        angle = np.linalg.norm(rotvec)
+        forms = [rotvec, rotvec * (1 - 2 * np.pi / angle)]
+        rotvec = min(forms, key=lambda form: np.linalg.norm(form - near))
+        poses.append(np.append(poses[-1][:3] + step[:3], rotvec))
+    grip = np.zeros((30, 1))
+    return replace(
+        recording((30,)),
+        state=np.hstack([poses, grip]).astype(np.float32),
+        action=np.hstack([steps, grip]).astype(np.float32),
+        meta={"positions_in_state": 1, "rotation_near_rad": list(near)},
+    )
+
+
+def test_rotations_of_an_arm_turn_with_the_scene_and_actions_still_lead_to_the_next_pose():
+    sizes = SimpleNamespace(**{**asdict(SIZES), "state_dim": 7, "action_dim": 7})
+    sampler = WindowSampler(arm_recording(), sizes, augment=True)
+    before = WindowSampler(arm_recording(), sizes).demonstration(0)
+    after = sampler.batch(4, seeded())
+    state, action = (
+        after["demo_state"][0].double().numpy(),
+        after["demo_action"][0].double().numpy(),
+    )
+    poses, turns = Rotation.from_rotvec(state[:, 3:6]), Rotation.from_rotvec(action[:-1, 3:6])
+    assert (turns * poses[:-1] * poses[1:].inv()).magnitude().max() < 1e-5
+    way = state[1:, :3] - state[:-1, :3]
+    np.testing.assert_allclose(way, action[:-1, :3], atol=1e-5)
+
+    # All by one turn, which is not small, and the vectors stay near the one that is named.
+    old = Rotation.from_rotvec(before["demo_state"][0, :, 3:6].double())
+    turned = poses * old.inv()
+    assert (turned * turned[0].inv()).magnitude().max() < 1e-5 < 0.01 < turned[0].magnitude() < 0.3
+    assert np.linalg.norm(state[:, 3:6] - np.array([0, np.pi, 0]), axis=1).max() < 1.0
+    angles = np.linalg.norm(state[:, 3:6], axis=1)
+    assert angles.min() < np.pi < angles.max()  # both forms are met
+
+
+def test_without_a_stretch_rotations_turn_as_the_points_do(monkeypatch):
+    monkeypatch.setattr(data, "STRETCH", 0.0)
+    a, _ = data.sample_affine_maps(5, torch.zeros(1, 3), seeded())
+    torch.testing.assert_close(data.nearest_rotations(a), a)
+    rotvec, near = torch.randn(5, 7, 3, generator=seeded()), torch.zeros(3)
+    turned = data.turn_rotation_vectors(rotvec, a, near)
+    for maps, vectors, results in zip(a, rotvec, turned):
+        expected = Rotation.from_matrix(maps.double()) * Rotation.from_rotvec(vectors.double())
+        np.testing.assert_allclose(results, expected.as_rotvec(), atol=1e-5)
+    still = data.turn_rotation_vectors(torch.zeros(1, 1, 3), torch.eye(3)[None], near)
+    assert still.abs().max() == 0
+
+
+def test_rotations_that_are_not_there_are_refused():
+    sound = arm_recording()
+    sound.check()
+    for near in ([0, 1], [0, "1", 0], [0, float("inf"), 0], 3.0):
+        with pytest.raises(RecordingError, match="rotation_near_rad is"):
+            replace(sound, meta={**sound.meta, "rotation_near_rad": near}).check()
+    with pytest.raises(RecordingError, match="not have 7 and 4 numbers"):
+        replace(sound, action=sound.action[:, :4]).check()
+    replace(sound, action=sound.action[:, :4], meta={"rotation_near_rad": [0, 3, 0]}).check()
 
 
 def test_colors_stay_as_they_are_where_scenes_are_moved():

@@ -33,8 +33,8 @@ import model
 import report
 import robot
 from robot import RTDE, Gripper, RobotError, Servo, Settings
-from tests.emulator import START_POSE, Emulator, write_scene
-from tests.fuzz_robot import fuzz_robot
+from tests.emulator import START_POSE, Emulator, turned, write_scene
+from tests.fuzz_robot import fuzz_pose, fuzz_robot, simulated_arm
 
 ROOT = Path(__file__).parents[1]
 CAMERA_TO_BASE = [[1, 0, 0, -0.2], [0, -1, 0, -0.55], [0, 0, -1, 0.9], [0, 0, 0, 1]]
@@ -124,11 +124,8 @@ def test_the_state_is_read_whole_however_the_bytes_arrive(emulator, settings):
         state = rtde.state(0.5)
         np.testing.assert_allclose(state.pose, START_POSE)
         v = state.values
-        assert (v["robot_mode"], v["safety_mode"], v["robot_status_bits"]) == (
-            7,
-            1,
-            1,
-        ) and state.trouble() is None
+        assert (v["robot_mode"], v["safety_mode"], v["robot_status_bits"]) == (7, 1, 1)
+        state.check()
         first = v["timestamp"]
         time.sleep(0.2)
         assert rtde.state(0.5).values["timestamp"] > first
@@ -145,6 +142,31 @@ def test_what_the_controller_refuses_is_named(emulator, settings):
     emulator.faults.in_use, emulator.faults.refuse_version = set(), True
     with pytest.raises(RobotError, match="protocol version 2"):
         connect(settings)
+
+
+def test_old_software_is_refused_with_the_advice_to_update(emulator, settings):
+    emulator.faults.not_found, emulator.faults.version = {"tcp_offset"}, (5, 4, 3)
+    advice = r"tcp_offset is NOT_FOUND .*software 5\.4\.3: update it, 5\.5\.1 or later is needed"
+    with pytest.raises(RobotError, match=advice):
+        connect(settings)
+    emulator.faults.version = (10, 7, 0)  # of PolyScope X: an update is no cure
+    with pytest.raises(RobotError, match=r"not known to the controller's software 10\.7\.0\)"):
+        connect(settings)
+
+
+def test_a_handshake_that_fails_closes_its_connection(emulator, settings, monkeypatch):
+    opened, create = [], socket.create_connection
+
+    def remember(*args):
+        opened.append(create(*args))
+        return opened[-1]
+
+    monkeypatch.setattr(socket, "create_connection", remember)
+    for fault in ({"refuse_version": True}, {"not_found": {"payload"}}, {"drop": True}):
+        emulator.faults = type(emulator.faults)(**fault)
+        with pytest.raises(RobotError):
+            connect(settings)
+        assert opened.pop().fileno() == -1
 
 
 def test_two_clients_cannot_both_write_and_the_registers_are_free_again_afterwards(
@@ -296,6 +318,18 @@ def test_relative_actions_compose_and_differ_consistently():
         )
 
 
+def test_rotations_compose_as_scipys_do_near_0_and_near_pi_too():
+    rng = np.random.default_rng(0)
+    for size in (0.0, 1e-12, 1e-6, 1.0, np.pi - 1e-9, np.pi):
+        for _ in range(20):
+            first, second = rng.normal(size=(2, 3))
+            first *= size / np.linalg.norm(first)
+            theirs = Rotation.from_rotvec(second) * Rotation.from_rotvec(first)
+            for both in (robot.rotate(first, second), turned(first, second)):
+                assert (Rotation.from_rotvec(both) * theirs.inv()).magnitude() < 1e-9
+                assert np.linalg.norm(both) < np.pi + 1e-12
+
+
 def test_interpolation_is_straight_and_scipys_slerp():
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -313,6 +347,69 @@ def test_interpolation_is_straight_and_scipys_slerp():
 
 
 # ---- Motion --------------------------------------------------------------------------------------
+
+
+def test_a_tool_that_points_down_arrives_although_its_rotation_vector_may_flip():
+    settings = Settings(**BOXES, max_speed_rad_s=2.0, max_lag_rad=0.4)
+    for angle in np.linspace(0, 6, 60)[[0, 3, 13, 33, 47]]:  # where vectors that are compared fail
+        down = np.array([-0.2, -0.5, 0.3, np.pi * np.cos(angle), np.pi * np.sin(angle), 0.0])
+        start = robot.compose(down, np.array([0.01, 0.0, 0.0, 0.1, -0.1, 0.05]))
+        with simulated_arm(settings, start) as arm:
+            arm.servo.go(down)
+            assert robot.distance(arm.pose, down).max() < 5e-3
+
+
+@pytest.mark.parametrize("seed", [0, 1, 59, 74])
+def test_every_pose_in_the_box_is_reached_in_the_time_that_the_way_needs(seed):
+    """Of these two end where a rotation vector flips its sign."""
+    seconds, needed = fuzz_pose(seed)
+    assert needed <= seconds <= needed + 1
+
+
+def test_a_servo_that_does_not_arrive_is_stopped_and_holds_nothing_for_ever(monkeypatch):
+    monkeypatch.setattr(Servo, "REACHED", -1.0)  # it can never be near enough
+    with simulated_arm(Settings(**BOXES), np.array(START_POSE)) as arm:
+        with pytest.raises(RobotError, match="is not reached"):
+            arm.servo.go(robot.compose(np.array(START_POSE), np.full(6, 0.01)))
+        assert arm.stopped
+
+
+def test_a_target_that_is_never_reached_does_not_keep_an_arm_from_being_held_too_long(monkeypatch):
+    monkeypatch.setattr(Servo, "REACHED", -1.0)
+    with simulated_arm(Settings(**BOXES, max_hold_s=0.5), np.array(START_POSE)) as arm:
+        arm.servo.follow(steps(dx=0.03, drz=0.02))
+        arm.sleep(1.2)  # 0.8 s, and longer for a step that is faster than the arm may go
+        with pytest.raises(RobotError, match=r"no new actions for 0\.5 s"):
+            arm.sleep(1.5)
+        expected = np.array(START_POSE)
+        for action in steps(dx=0.03, drz=0.02):
+            expected = robot.compose(expected, action)
+        assert robot.distance(arm.pose, expected).max() < 1e-3
+
+
+def test_a_corner_of_the_box_that_was_rounded_to_float32_can_be_gone_to():
+    high = np.array([0.2, -0.2, 0.6])
+    recorded = np.append(high.astype(np.float32).astype(float), START_POSE[3:])
+    assert (recorded[:3] > high).any()
+    with simulated_arm(Settings(**BOXES), np.array([0.19, -0.21, 0.59, *START_POSE[3:]])) as arm:
+        arm.servo.go(recorded)
+    for change, message in (
+        ([1e-5, 0, 0, 0, 0, 0], "outside its box"),
+        ([np.nan, 0, 0, 0, 0, 0], "not finite"),
+        ([0, 0, 0, 0, 0, np.nan], "not finite"),
+    ):
+        with simulated_arm(Settings(**BOXES), np.array(START_POSE)) as arm:
+            with pytest.raises(RobotError, match=message):
+                arm.servo.go(recorded + np.array(change))
+            assert arm.stopped
+
+
+def test_the_same_tcp_is_the_same_whatever_its_rotation_vector():
+    down = [0.0, 0.0, 0.17, 0.0, 3.1416, 0.0]
+    assert robot.same_tcp(down, [0.0, 0.0, 0.17005, 0.0, -3.1416, 0.0])
+    assert not robot.same_tcp(down, [0.0, 0.0, 0.171, 0.0, 3.1416, 0.0])
+    for other in (None, [0.0], "no list", [None] * 6):
+        assert not robot.same_tcp(other, down)
 
 
 def test_of_the_two_vectors_of_a_rotation_the_nearer_is_taken():
@@ -406,7 +503,7 @@ def test_a_target_outside_the_box_is_clamped_if_asked(emulator, settings):
 @pytest.mark.parametrize(
     "fault, message",
     [
-        ({"silent": True}, "the newest state is 0."),
+        ({"silent": True}, "no newer one has arrived: look for the network or the controller"),
         ({"drop": True}, "connection"),
         ({"garbage": True}, "framing lost"),
         ({"safety_mode": 3, "safety_status_bits": 0b100}, "safety: protective stop"),
@@ -430,13 +527,12 @@ def test_trouble_with_the_controller_stops_the_arm_for_good(emulator, settings, 
         for name, value in fault.items():
             setattr(emulator.faults, name, value)
         assert message in stops(servo)
-        count = len(emulator.received) + (0 if "deaf" in fault else 1)  # and the stop
         emulator.faults = type(emulator.faults)()  # all is well again, but the arm stays stopped
         with pytest.raises(RobotError, match=message):
             servo.follow(STILL)
         time.sleep(0.05)
-        later = [fields["input_int_register_24"] for _, fields in emulator.received[count:]]
-        assert not any(later) or "deaf" in fault  # what the deaf one had not read
+        commands = [fields["input_int_register_24"] for _, fields in emulator.received]
+        assert robot.STOP not in commands[:-1]  # nothing comes after it
     assert_within_limits(emulator, settings)
     assert not any(
         line.startswith(("unlock", "power", "brake", "play")) for line in emulator.dashboard_lines
@@ -644,14 +740,78 @@ def test_states_that_come_later_and_later_stop_the_arm(emulator, settings):
         servo.thread.join()
         servo.delay = math.inf  # the first state below is the promptest
         state, now = servo.rtde.state(), time.monotonic()
-        for tick in range(200):  # the network delays each package by 2 ms more than the one before
-            values = state.values.copy()
-            values["timestamp"] += 0.008 * tick
-            values["output_int_register_25"] += tick
-            late = servo.trouble(state._replace(values=values), now + 0.010 * tick)
-            if late:
-                break
-        assert "later than at first" in late and 0.25 < 0.002 * tick < 0.3
+        with pytest.raises(RobotError, match="later than at first"):
+            for tick in range(200):  # each package is delayed by 2 ms more than the one before
+                values = state.values.copy()
+                values["timestamp"] += 0.008 * tick
+                values["output_int_register_25"] += tick
+                servo.check_state(state._replace(values=values), now + 0.010 * tick)
+        assert 0.25 < 0.002 * tick < 0.3
+
+
+@pytest.mark.parametrize(
+    "computed, activity, culprit",
+    [
+        (0.10, "sampling the cloud", "it kept Python's lock, or all processors"),
+        (0.01, "sampling the cloud", "other programs had the processors"),
+        (0.01, robot.WRITING, "the disk is slow"),
+    ],
+)
+def test_a_state_that_is_late_since_the_computer_is_busy_says_with_what(
+    computed, activity, culprit
+):
+    with simulated_arm(Settings(**BOXES), np.array(START_POSE)) as arm:
+        arm.computed = 5.0
+        arm.servo.step()
+        with arm.servo.activity.during("reading the camera"):
+            arm.now += 0.01
+        with arm.servo.activity.during(activity):
+            arm.now += 0.09
+        arm.now += 0.006
+        arm.computed += computed
+        arm.stale = robot.StaleState("the newest state is 0.106 s old", arrived=True)
+        with pytest.raises(RobotError) as caught:
+            arm.servo.step()
+        arm.stale, arm.runs = None, False
+        with pytest.raises(RobotError) as ended:
+            arm.servo.step()
+    message = str(caught.value)
+    assert message.startswith("the newest state is 0.106 s old, but newer ones have arrived")
+    stall = message.partition("arrived")[2]
+    assert str(ended.value) == f"the program on the controller has ended, or is paused{stall}"
+    assert f"For 0.106 s the stream stood still, in which this program computed for {computed:.3f}"
+    assert f"longest at {activity}, 0.090 s: {culprit}" in message
+
+
+def test_what_the_main_thread_is_at_counts_too_and_what_is_long_ago_does_not(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(robot, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    activity = robot.Activity()
+    assert activity.longest(0.0, 1.0) == ("waiting", 0.0)
+    with activity.during("long ago"):
+        now[0] = 5.0
+    with activity.during("computing actions"):
+        now[0] = 5.5
+        assert activity.longest(4.9, 5.5) == ("computing actions", 0.5)
+
+
+def test_a_late_state_that_has_arrived_is_told_from_one_that_has_not(emulator, settings):
+    rtde = connect(settings, write=False)
+    rtde.state(0.5)
+    rtde.package = lambda: time.sleep(0.5) or ("?", b"")  # the reader's thread gets no turn
+    time.sleep(0.2)
+    with pytest.raises(robot.StaleState, match="the newest state is") as caught:
+        rtde.state(0.05)
+    assert caught.value.arrived
+    rtde.close()
+    rtde = connect(settings, write=False)
+    rtde.state(0.5)
+    emulator.faults.silent = True
+    time.sleep(0.2)
+    with pytest.raises(robot.StaleState) as caught:
+        rtde.state(0.05)
+    assert not caught.value.arrived
+    rtde.close()
 
 
 def test_a_program_that_does_not_end_is_told(emulator, settings, capsys):
@@ -1000,6 +1160,35 @@ class Typing:
             for seconds, key in keys:
                 time.sleep(seconds)
                 os.write(writing, f"{key}\n".encode())
+        time.sleep(20)  # an episode that a busy machine has dropped must not be waited for
+        os.close(writing)
+
+
+class Script:
+    """Standard input that a script has written, and closed."""
+
+    def __init__(self, monkeypatch, text):
+        reading, writing = os.pipe()
+        os.write(writing, text.encode())
+        os.close(writing)
+        monkeypatch.setattr(sys, "stdin", os.fdopen(reading))
+
+
+def test_a_script_that_has_written_its_keys_ends_the_recording(monkeypatch, capsys):
+    Script(monkeypatch, "s\r\n E\n")
+    with robot.Keys() as keys:
+        assert [keys.pressed() for _ in range(4)] == ["s", "e", "q", "q"]
+    monkeypatch.setattr(sys, "stdin", None)  # of a service
+    with pytest.raises(common.UserError, match="standard input is closed"):
+        robot.Keys().__enter__()
+
+
+def test_a_recording_can_be_driven_without_a_terminal(emulator, cell, monkeypatch, capsys):
+    Script(monkeypatch, "s\ne\ns\n")  # a key a frame: an episode of one, and one that is not ended
+    assert ends(record(cell, 2)) == 0
+    assert "dropped: the last episode was not ended" in capsys.readouterr().out
+    assert len(data.load_demonstrations("demos/stack-cube.npz")) == 1
+    assert is_held(emulator)
 
 
 def record(cell, episodes, *more):
@@ -1037,6 +1226,20 @@ def test_check_reports_everything_and_moves_nothing(emulator, cell, capsys):
         assert message in capsys.readouterr().err
     assert emulator.received == [] and emulator.programs == []
     assert all(frame[1] == 3 for frame in emulator.gripper_frames)  # reads only
+
+
+def test_check_needs_no_dashboard_which_polyscope_x_does_not_have(emulator, cell, capsys):
+    emulator.faults.version = (10, 7, 0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]  # where nobody listens afterwards
+    content = json.loads(Path("robot.json").read_text())
+    Path("robot.json").write_text(json.dumps(content | {"dashboard_port": port}))
+    assert ends(["check", *cell]) == 0
+    printed = capsys.readouterr().out
+    for part in ("PolyScope X has none", "unknown: look at the panel", "software 10.7.0", "ready"):
+        assert part in printed, part
+    emulator.faults.safety_mode = 3
+    assert ends(["check", *cell]) == 2 and "protective stop" in capsys.readouterr().err
 
 
 def test_the_picture_shows_the_cloud_and_both_boxes_of_any_data(tmp_path, monkeypatch):
@@ -1080,6 +1283,7 @@ def test_recording_keeps_finished_episodes_and_drops_the_others(
     assert abs(np.diff(state[:, 0])).sum() > 0.01  # the hand did move the arm
     assert action[0, 6] == 0 and action[-1, 6] == 1  # g closed the gripper on the way
     meta = recorded.meta
+    assert meta["positions_in_state"] == 1 and meta["rotation_near_rad"] == [0, 3.14159, 0]
     assert meta["policy_hz"] == 20 and meta["tcp_offset"][2] == 0.17 and meta["payload_kg"] == 1.1
     assert len(meta["time_s"]) == len(meta["points_seen"]) == len(recorded.state)
     assert np.diff(meta["time_s"][: frames.start]).mean() == pytest.approx(0.05, abs=0.01)
