@@ -1228,7 +1228,7 @@ class Servo:
         late = 1000 * np.array(self.lateness or [0.0])  # milliseconds
         oldest = 1000 * max(self.ages, default=0.0)
         return (
-            f"{len(self.lateness)} packages at {self.settings.servo_hz:g} Hz: late by "
+            f"{len(self.lateness)} packets at {self.settings.servo_hz:g} Hz: late by "
             f"{np.percentile(late, 50):.2f} ms (median), {np.percentile(late, 99):.2f} ms (99 %), "
             f"{late.max():.2f} ms (worst); oldest state {oldest:.1f} ms"
         )

@@ -1496,7 +1496,7 @@ def test_running_moves_the_arm_within_its_limits_and_ends_with_a_stop(
 ):
     assert ends([*running, "--seconds", "1"]) == 0, capsys.readouterr().err
     printed = capsys.readouterr().out
-    assert "stack-cube: run" in printed and "packages at 125 Hz" in printed
+    assert "stack-cube: run" in printed and "packets at 125 Hz" in printed
     assert np.linalg.norm(np.subtract(emulator.pose, START_POSE)[:3]) > 1e-3
     assert emulator.registers[0x0200] == 1
     assert any(frame[3] == 3 for frame in emulator.gripper_frames)
