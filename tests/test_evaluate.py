@@ -43,7 +43,7 @@ def features(instructions, weights, identity):
     return 10 * torch.eye(512)[rows], identity or "words"
 
 
-def run_here(job, jobs, *, workers, total, description, setup):
+def run_here(job, jobs, *, workers, total, description, unit, setup):
     """In place of `common.run_jobs`: in this process."""
     setup()
     return [job(**arguments) for arguments in jobs]
