@@ -98,7 +98,7 @@ def test_help_says_each_presets_value(capsys):
     with pytest.raises(SystemExit):
         train.parse(["--help"])
     printed = " ".join(capsys.readouterr().out.split())
-    assert "outer steps (paper 54000, small 10000, tiny 30)" in printed
+    assert "outer steps (paper 54000, small 8000, tiny 30)" in printed
     assert "of weights, batches and noise (0)" in printed
     assert "(paper 512, small 128, tiny 64)" in printed
 
@@ -440,7 +440,7 @@ def test_a_run_stopped_while_it_is_evaluated_is_evaluated_when_resumed(
 
     def evaluated(**options):
         asked.append(options)
-        return successes
+        return report.Outcomes(any_step=successes, at_end=successes)
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", evaluated)
     train.main([*argv, "--resume"])
@@ -462,7 +462,8 @@ def test_a_run_is_evaluated_and_resumed_where_it_was_asked_for(bowl, monkeypatch
         evaluated.append(checkpoint.stem)
         if evaluated == ["ema-00002"]:
             signal.raise_signal(signal.SIGINT)
-        return {"pour": [True], "stir": [True]}
+        outcomes = {"pour": [True], "stir": [True]}
+        return report.Outcomes(any_step=outcomes, at_end=outcomes)
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", evaluate_and_stop)
     argv = [*bowl, *"--evaluate-every 2 --checkpoint-every 3 --held-out 1 --out run".split()]
