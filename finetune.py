@@ -35,6 +35,7 @@ from data import (
     WindowSampler,
     hold_out,
     load_demonstrations,
+    suspicions,
     write_text,
 )
 from model import CheckpointError, DAMIPolicy, ema_model
@@ -534,6 +535,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     # A recording in a file, one's own or a simulator's; or tasks of a simulator to collect
     file = Path(args.data) if args.data.endswith(".npz") else None
     recording = None if file is None else load_demonstrations(file)
+    for line in suspicions(recording) if recording is not None else ():
+        print(f"{file}: {line}", flush=True)
     simulated = recording is None or made_by_simulator(recording)
     if recording is None and settings.demonstrations is None:
         settings = replace(settings, demonstrations=COLLECTED)

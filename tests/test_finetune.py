@@ -246,13 +246,16 @@ def test_rollouts_read_the_demonstrations_that_were_adapted_to(run, recorded, mo
 
 
 def test_own_recordings_are_adapted_to_without_a_simulator(run, capsys):
-    save_recording(".", own_recording(frames=150))
+    recording = own_recording(frames=150)
+    recording["state"][5, 0] = 1e6
+    save_recording(".", recording)
     checkpoint = ["--checkpoint", str(run / "ema-00006.pt")]
     finetune.main(["--data", "stir.npz", *checkpoint, "--demonstrations", "1", "--steps", "2"])
     folder = Path("runs/finetune/stir-seed0")
     names = ["adapted.pt", "config.json", "metrics.jsonl"]
     assert sorted(path.name for path in folder.iterdir() if path.name != ".lock") == names
-    assert "adapted to stir" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "adapted to stir" in printed and "stir.npz: state 0 is 1e+06 in frame 5" in printed
 
 
 def test_held_out_episodes_tell_what_adaptation_bought(run, capsys):
