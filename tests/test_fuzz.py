@@ -5,6 +5,7 @@ import os
 import random
 import time
 from contextlib import suppress
+from dataclasses import replace
 
 import pytest
 import torch
@@ -126,7 +127,7 @@ def test_an_edited_configuration_is_refused_before_memory_is_taken(tmp_path, cha
     ],
 )
 def test_shapes_that_would_broadcast_are_refused(changes):
-    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+    policy = model.DAMIPolicy(replace(model.PRESETS["tiny"], num_points=8))
     shapes = {"points": (2, 2, 8, 3), "state": (2, 2, 9), "action": (2, 16, 4), "noise": (2, 16, 4)}
     batch = {name: torch.zeros(shape) for name, shape in (shapes | changes).items()}
     batch["timesteps"] = torch.zeros(changes.get("timesteps", (2,)), dtype=torch.int64)
