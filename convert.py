@@ -298,8 +298,8 @@ def unit_in_metres(path: Path, name: str, stated: Any, camera: Camera) -> float:
         return camera.depth_scale
     scale = UNITS.get(stated, stated) if isinstance(stated, str) else stated
     if type(scale) not in (int, float) or not 0 < scale < math.inf:
-        said = "nothing says" if stated is None else f"{stated!r} does not say"
-        refuse(path, f"{said} in which unit {name} is: add --depth-unit mm, m, or metres a unit")
+        problem = "nothing says" if stated is None else f"{stated!r} does not say"
+        refuse(path, f"{problem} in which unit {name} is: add --depth-unit mm, m, or metres a unit")
     return float(scale)
 
 
@@ -895,8 +895,8 @@ class HDF5:
                 self.extrinsics = self.choose_camera("extrinsic_cv", first)
             if self.intrinsics is None and self.camera.intrinsics is None:
                 refuse(path, f"{self.cloud} needs the camera's {LENS}: write them to --camera")
-        self.read = {"actions", *self.state, self.cloud, self.color}
-        self.read |= {self.intrinsics, self.extrinsics}
+        cameras = (self.intrinsics, self.extrinsics)
+        self.read = {"actions", *self.state, self.cloud, self.color, *cameras}
 
     def stated_unit(self, first: dict[str, Any]) -> Any:
         """The unit of depth, if an attribute of the array says it."""
@@ -1097,10 +1097,12 @@ def read_episodes(
 
 def choose_instruction(path: Path, frame: Frame, given: str | None) -> str:
     """What is done: the instruction that is given, or else what the source says."""
-    said = given or frame.instruction
-    if isinstance(said, str) and said.strip():
-        return said
-    problem = "does not say" if said is None else f"says by {said!r}, which is no text,"
+    instruction = given or frame.instruction
+    if isinstance(instruction, str) and instruction.strip():
+        return instruction
+    problem = "does not say"
+    if instruction is not None:
+        problem = f"says by {instruction!r}, which is no text,"
     refuse(path, f'it {problem} what is done: add --instruction "Stir the soup."')
 
 

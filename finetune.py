@@ -292,14 +292,29 @@ def adapt_checkpoint(
         )
         print(table, flush=True)
         write_text(folder / "held-out.md", f"{table}\n\n{report.HELDOUT_NOTE}\n")
-    written = {
+    description = describe_adaptation(
+        checkpoint, recording, settings, curve=curve, config_overrides=config_overrides
+    )
+    write_text(folder / "config.json", json.dumps({**description, "seconds": seconds}, indent=1))
+    return seconds
+
+
+def describe_adaptation(
+    checkpoint: Path,
+    recording: Path,
+    settings: Settings,
+    *,
+    curve: Sequence[int],
+    config_overrides: dict[str, Any] | None,
+) -> dict[str, Any]:
+    """What config.json says of an adaptation, beside its seconds: all that decides its results."""
+    return {
         "checkpoint": str(checkpoint),
         "data": str(recording),
+        "curve": list(curve),
+        "config_overrides": config_overrides or {},
         **asdict(settings),
-        "seconds": seconds,
     }
-    write_text(folder / "config.json", json.dumps(written, indent=1))
-    return seconds
 
 
 def read_instructions(paths: dict[str, Path], settings: Settings) -> dict[str, str]:
@@ -393,12 +408,18 @@ def claim_folders(folders: Iterable[Path], checkpoint: Path, overwrite: bool) ->
 
 
 def read_measured(
-    folders: dict[str, Path], paths: dict[str, Path], checkpoint: Path, settings: Settings
+    checkpoint: Path,
+    paths: dict[str, Path],
+    folders: dict[str, Path],
+    settings: Settings,
+    *,
+    curve: Sequence[int],
+    config_overrides: dict[str, Any],
 ) -> dict[str, tuple[dict[str, Outcomes], float]]:
     """What an interrupted run has measured: task -> (column -> outcomes, seconds of adapting).
 
-    `folders` and `paths` are task -> its folder and its recording. Raises UserError for a task that
-    was adapted to in another way than `settings`, or on something else.
+    Arguments as of `adapt_tasks`. Raises UserError for a task that was adapted to or rolled out in
+    another way than these say.
     """
     measured = {}
     for task, folder in folders.items():
@@ -406,8 +427,10 @@ def read_measured(
             continue
         config = json.loads((folder / "config.json").read_text())
         seconds = config.pop("seconds")
-        now = {"checkpoint": str(checkpoint), "data": str(paths[task]), **asdict(settings)}
-        changed = [name for name, value in now.items() if config.get(name) != value]
+        expected = describe_adaptation(
+            checkpoint, paths[task], settings, curve=curve, config_overrides=config_overrides
+        )
+        changed = [name for name, value in expected.items() if config.get(name) != value]
         if changed:
             raise UserError(
                 f"{folder} was made with another {', '.join(changed)}: give the same as then, or "
@@ -535,8 +558,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     # A recording in a file, one's own or a simulator's; or tasks of a simulator to collect
     file = Path(args.data) if args.data.endswith(".npz") else None
     recording = None if file is None else load_demonstrations(file)
-    for line in suspicions(recording) if recording is not None else ():
-        print(f"{file}: {line}", flush=True)
+    if recording is not None:
+        for suspicion in suspicions(recording):
+            print(f"{file}: {suspicion}", flush=True)
     simulated = recording is None or made_by_simulator(recording)
     if recording is None and settings.demonstrations is None:
         settings = replace(settings, demonstrations=COLLECTED)
@@ -564,6 +588,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     name = "-".join(args.task or tasks)
     out = Path(args.out or f"runs/finetune/{name}-seed{settings.seed}")
     several = len(tasks) > 1 or args.task == ["novel"]
+    if args.resume and not several:
+        raise UserError("--resume goes on with several tasks: adapt to this one with --overwrite")
     folders = {task: out / task if several else out for task in tasks}
 
     with common.locked(out):
@@ -572,8 +598,15 @@ def main(argv: Sequence[str] | None = None) -> None:
         else:
             paths = {recording.task: file}
         measured = {}
-        if args.resume and several:
-            measured = read_measured(folders, paths, checkpoint, settings)
+        if args.resume:
+            measured = read_measured(
+                checkpoint,
+                paths,
+                folders,
+                settings,
+                curve=args.curve,
+                config_overrides=config_overrides,
+            )
         unfinished = [folder for task, folder in folders.items() if task not in measured]
         old_files = claim_folders({out, *unfinished}, checkpoint, args.overwrite or args.resume)
         if recording is None:

@@ -1810,8 +1810,9 @@ COMMANDS = {"check": check, "record": record, "replay": replay, "run": run, "cam
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    about = "Record, check and run on a UR10e. Keep a hand on the emergency stop."
-    parser = argparse.ArgumentParser(description=about)
+    parser = argparse.ArgumentParser(
+        description="Record, check and run on a UR10e. Keep a hand on the emergency stop."
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     for name, function in COMMANDS.items():
         text = function.__doc__

@@ -184,6 +184,11 @@ def task_batch(
     return {name: x.to(text.device) for name, x in batch.items()}
 
 
+def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
+    """The loss () of a policy with these parameters in place of its own, as maml.py takes it."""
+    return functional_call(policy, params, (), batch)
+
+
 def multi_task_loss(policy: DAMIPolicy, batches: list[dict[str, Tensor]]) -> Tensor:
     """The mean loss () of all windows of all tasks, whose batches are as long as each other."""
     if len({batch["demo_points"].shape for batch in batches}) == 1:  # demonstrations can be stacked
@@ -215,12 +220,8 @@ def maml_gradient(
     `batches` are those of `task_batch`, one for each task, `vectorize` of which run at once.
     Returns parameter name -> gradient, and the mean query loss after the inner step, ().
     """
-
-    def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
-        return functional_call(policy, params, (), batch)
-
     gradients, losses = meta_gradient(
-        loss_fn,
+        partial(loss_of, policy),
         dict(policy.named_parameters()),
         [split(batch, settings.support) for batch in batches],
         lr=settings.inner_lr,
@@ -585,9 +586,6 @@ def heldout_controls(
     if settings.maml == "off":
         return rows
 
-    def loss_fn(params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
-        return functional_call(policy, params, (), batch)
-
     params = {name: p.detach() for name, p in policy.named_parameters()}
     for steps in (1, 5):
         measured = {}
@@ -602,7 +600,8 @@ def heldout_controls(
             )
             adapted = copy.deepcopy(policy)
             adapted.load_state_dict(
-                adapt(loss_fn, params, support, settings.inner_lr, steps), strict=False
+                adapt(partial(loss_of, policy), params, support, settings.inner_lr, steps),
+                strict=False,
             )
             measured[task] = evaluate.action_error(
                 adapted, train_samplers[task], heldout_sampler, text[task]
@@ -855,9 +854,10 @@ def run(
         task: load_demonstrations(path).take(settings.demonstrations)
         for task, path in paths.items()
     }
-    for task, recording in recordings.items() if rank == 0 else ():
-        for line in suspicions(recording):
-            print(f"{paths[task]}: {line}", flush=True)
+    if rank == 0:
+        for task, recording in recordings.items():
+            for suspicion in suspicions(recording):
+                print(f"{paths[task]}: {suspicion}", flush=True)
     config = fit_to_recordings(
         config,
         list(recordings.values()),

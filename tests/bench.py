@@ -53,7 +53,7 @@ from metaworld_env import MetaWorld
 from model import PRESETS, CheckpointError, DAMIPolicy, PolicyConfig, split
 from simulator import collect, demonstration_seed, evaluation_seed, record_episode
 from tests.textbook import TextbookDP3, training_step
-from train import SETTINGS, Settings, multi_task_gradient, task_batch
+from train import SETTINGS, Settings, loss_of, multi_task_gradient, task_batch
 
 SIMULATOR = MetaWorld()
 SUITE = "ml10"
@@ -234,11 +234,6 @@ class Bench:
         context = self.encode()
         frames = self.sampler.gather(torch.tensor([100]))
         return lambda: self.policy.sample_actions(frames["points"], frames["state"], context)
-
-
-def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: Batch) -> Tensor:
-    """The loss () of a policy with these parameters in place of its own."""
-    return functional_call(policy, params, (), batch)
 
 
 def episode_seconds(task: str, device: torch.device, repeat: int) -> float:

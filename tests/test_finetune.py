@@ -231,6 +231,12 @@ def test_an_interrupted_run_of_several_tasks_goes_on_with_those_that_are_left(
     assert "add --overwrite" in fails(finetune, argv, capsys)
     message = fails(finetune, [*argv, "--resume", "--batch", "3"], capsys)
     assert "both/door-close was made with another batch: give the same" in message
+    for flags, name in (("--curve 1", "curve"), ("--n-action-steps 4", "config_overrides")):
+        message = fails(finetune, [*argv, "--resume", *flags.split()], capsys)
+        assert f"was made with another {name}" in message
+    alone = [*adapting(run, recorded), "--out", "both/door-close", "--resume"]
+    assert "--resume goes on with several tasks" in fails(finetune, alone, capsys)
+    assert fingerprint(Path("both/door-close")) == finished
     finetune.main([*argv, "--resume"])
     assert fingerprint(Path("both/door-close")) == finished
     successes = json.loads(Path("both/success.json").read_text())["successes"]
