@@ -122,7 +122,9 @@ def rollout(
 
         taken = 0
         for e, chunk in zip(list(running), chunks):
-            seen, of_steps, ended = take_actions(environments[e], chunk, To, stop_at_success)
+            seen, of_steps, ended = take_actions(
+                environments[e], chunk, n_observations=To, stop_at_success=stop_at_success
+            )
             observations[e] = [*observations[e], *seen][-To:]
             successes[e] += of_steps
             taken += len(of_steps)
@@ -217,7 +219,8 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
             arguments = json.loads(config.read_text())["arguments"]
             last = config.parent / f"ema-{arguments['steps']:05d}.pt"
             if arguments["suite"] == suite and last.is_file():
-                (tiny if arguments["preset"] == "tiny" else finished).append(last)
+                runs_of_preset = tiny if arguments["preset"] == "tiny" else finished
+                runs_of_preset.append(last)
     if finished:
         return max(finished, key=lambda path: path.stat().st_mtime)
     if suite != "ml10" or not SHIPPED_CHECKPOINT.is_file():

@@ -197,8 +197,12 @@ def write_report(
         checkpoints: label -> results of other checkpoints; they go only into success.json.
     """
     any_step = {label: outcome.any_step for label, outcome in outcomes.items()}
-    at_end = {label: o.at_end for label, o in outcomes.items() if o.at_end is not None}
-    columns = {**any_step, **{f"{label}, at the end": of_end for label, of_end in at_end.items()}}
+    at_end = {
+        label: outcome.at_end for label, outcome in outcomes.items() if outcome.at_end is not None
+    }
+    columns = dict(any_step)
+    for label, successes in at_end.items():
+        columns[f"{label}, at the end"] = successes
     table = success_table(columns, parts, paper)
     report = {"provenance": provenance, "successes": any_step, "successes at the end": at_end}
     if checkpoints:

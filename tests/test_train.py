@@ -266,7 +266,10 @@ def plain_meta_training(policy, samplers, text, settings):
         yield theta, average, loss.item(), torch.stack(before).mean().item(), norm.item()
 
 
-def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_written_out():
+def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_written_out(
+    monkeypatch,
+):
+    monkeypatch.setattr(train, "LOSS_BEFORE_EVERY", 2)
     samplers, text = two_tasks()
     settings = train.Settings(
         seed=3, steps=4, support=2, query=3, inner_lr=0.05, lr=1e-2, warmup=2, vectorize=2
@@ -283,8 +286,8 @@ def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_writ
     training = train.meta_train(state, samplers, text, settings)
     for k, (theta, averaged, loss, before, norm), figures in zip(range(4), plain, training):
         assert state.step == k + 1 and figures["loss"] == pytest.approx(loss, rel=1e-9)
-        assert ("loss_before" in figures) == (k == 0)  # it is not measured at every step
-        if k == 0:
+        assert ("loss_before" in figures) == (k % 2 == 0)  # it is not measured at every step
+        if k % 2 == 0:
             assert figures["loss_before"] == pytest.approx(before, rel=1e-9)
         assert figures["gradient_norm"] == pytest.approx(norm, rel=1e-9)
         for name, parameter in policy.named_parameters():
@@ -576,6 +579,9 @@ def test_two_processes_under_torchrun_train_as_one_does(pair, tmp_path):
     for one, both in zip(metrics(tmp_path / "one"), metrics(tmp_path / "two"), strict=True):
         assert both["loss"] == pytest.approx(one["loss"], rel=1e-4)
         assert both["gradient_norm"] == pytest.approx(one["gradient_norm"], rel=1e-3)
+        assert ("loss_before" in both) == ("loss_before" in one) == (one["step"] == 1)
+        if "loss_before" in one:
+            assert both["loss_before"] == pytest.approx(one["loss_before"], rel=1e-4)
 
     def all_weights(policy):
         return torch.cat([policy[n].flatten() for n in one if "normalizer" not in n])
