@@ -211,6 +211,15 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
         pass
 
 
+@pytest.fixture
+def ctrl_c_interrupts():
+    """Ctrl-C raises KeyboardInterrupt, though the tests may run under `nohup`, which ignores it."""
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, handler)
+
+
+@pytest.mark.usefixtures("ctrl_c_interrupts")
 def test_a_first_ctrl_c_is_a_request_and_a_second_one_stops():
     before = signal.getsignal(signal.SIGINT)
     with common.StopRequest() as stop:
@@ -223,17 +232,14 @@ def test_a_first_ctrl_c_is_a_request_and_a_second_one_stops():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.usefixtures("ctrl_c_interrupts")
 def test_where_a_stop_request_is_suspended_ctrl_c_stops_at_once():
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # `nohup` ignores it
-    try:
-        with common.StopRequest() as stop:
-            with pytest.raises(KeyboardInterrupt), stop.suspended():
-                os.kill(os.getpid(), signal.SIGINT)
-                time.sleep(1)
+    with common.StopRequest() as stop:
+        with pytest.raises(KeyboardInterrupt), stop.suspended():
             os.kill(os.getpid(), signal.SIGINT)
-            assert stop.requested
-    finally:
-        signal.signal(signal.SIGINT, handler)
+            time.sleep(1)
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.requested
 
 
 # ---- Worker processes ----------------------------------------------------------------------------
