@@ -211,15 +211,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
         pass
 
 
-@pytest.fixture
-def ctrl_c_interrupts():
-    """Ctrl-C raises KeyboardInterrupt, though the tests may run under `nohup`, which ignores it."""
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, handler)
-
-
-@pytest.mark.usefixtures("ctrl_c_interrupts")
+@pytest.mark.usefixtures("own_folder")  # where `nohup` ignores Ctrl-C, too
 def test_a_first_ctrl_c_is_a_request_and_a_second_one_stops():
     before = signal.getsignal(signal.SIGINT)
     with common.StopRequest() as stop:
@@ -232,7 +224,7 @@ def test_a_first_ctrl_c_is_a_request_and_a_second_one_stops():
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.usefixtures("ctrl_c_interrupts")
+@pytest.mark.usefixtures("own_folder")  # where `nohup` ignores Ctrl-C, too
 def test_where_a_stop_request_is_suspended_ctrl_c_stops_at_once():
     with common.StopRequest() as stop:
         with pytest.raises(KeyboardInterrupt), stop.suspended():
