@@ -17,7 +17,7 @@ import re
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -704,6 +704,8 @@ class WindowSampler:
         augment: `batch` moves each scene by an affine map of its own, where the recording says
             which numbers of a state are positions. Rotations turn along where it says which they
             are (`rotation_near_rad`); other directions in the state or the action stay as they are.
+        one_map: all scenes of a batch, its demonstration included, are moved by one map. Where a
+            task is a place that only its demonstrations show, maps of their own would hide it.
 
     Raises RecordingError for demonstrations that do not fit the policy: dimensions, points, length.
     """
@@ -717,6 +719,7 @@ class WindowSampler:
         after_success: int | None = None,
         late_fraction: float = 0.0,
         augment: bool = False,
+        one_map: bool = False,
     ) -> None:
         self.task = demonstrations.task
         self.instruction = demonstrations.instruction
@@ -735,6 +738,7 @@ class WindowSampler:
         # For augmentation
         self.positions_in_state = demonstrations.meta.get("positions_in_state", 0)
         self.augment = augment and self.positions_in_state > 0
+        self.one_map = one_map
         near = demonstrations.meta.get("rotation_near_rad")
         self.rotation_near: Tensor | None = None  # (3,)
         if self.positions_in_state == 1 and near is not None:
@@ -806,16 +810,16 @@ class WindowSampler:
         return len(self.windows)
 
     def sample(
-        self, n: int, generator: torch.Generator, exclude: int | None = None
+        self, n: int, generator: torch.Generator, episodes: Sequence[int] | None = None
     ) -> dict[str, Tensor]:
         """Draws n different windows (with repetition only where there are too few).
 
-        None is of the episode `exclude`, unless that is the only one. If there are no late windows,
-        early ones take their place.
+        They are of the episodes of these indices; None: of all. If there are no late windows, early
+        ones take their place.
         """
         allowed = torch.ones(len(self), dtype=torch.bool)
-        if exclude is not None and len(self.episodes) > 1:
-            allowed = self.episode_of != exclude
+        if episodes is not None:
+            allowed = torch.isin(self.episode_of, torch.tensor(episodes))
         early = torch.nonzero(allowed & ~self.late).flatten()
         late = torch.nonzero(allowed & self.late).flatten()
         if len(late) == 0:
@@ -854,32 +858,48 @@ class WindowSampler:
             "demo_action": self.action[None, frames],  # (1, T, A)
         }
 
-    def batch(self, n: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """Draws a reference demonstration, and n windows of other episodes where there are any."""
+    def batch(self, n: int, generator: torch.Generator, support: int = 0) -> dict[str, Tensor]:
+        """Draws a reference demonstration, and n windows of other episodes where there are any.
+
+        The first `support` windows are of other episodes than the rest, where there are enough: the
+        loss after an inner step on them does not fall because they were seen in it.
+        """
         reference = self.sample_episode(generator)
         demo = self.demonstration(reference)
-        windows = self.sample(n, generator, exclude=reference)
+        others = [e for e in range(len(self.episodes)) if e != reference] or [reference]
+        if 0 < support < n and len(others) > 1:
+            order = torch.randperm(len(others), generator=generator, device=generator.device)
+            shuffled = [others[i] for i in order.tolist()]
+            half = len(others) // 2
+            of_support = self.sample(support, generator, episodes=shuffled[:half])
+            of_query = self.sample(n - support, generator, episodes=shuffled[half:])
+            windows = {name: torch.cat([of_support[name], of_query[name]]) for name in of_query}
+        else:
+            windows = self.sample(n, generator, episodes=others)
+
         if self.augment:
+            demo_map = sample_affine_maps(1, self.center, generator)
+            maps = demo_map if self.one_map else sample_affine_maps(n, self.center, generator)
             demo["demo_points"], demo["demo_state"], demo["demo_action"] = self.move_scenes(
-                demo["demo_points"], demo["demo_state"], demo["demo_action"], generator
+                demo["demo_points"], demo["demo_state"], demo["demo_action"], *demo_map
             )
             windows["points"], windows["state"], windows["action"] = self.move_scenes(
-                windows["points"], windows["state"], windows["action"], generator
+                windows["points"], windows["state"], windows["action"], *maps
             )
         return {**windows, **demo}
 
     def move_scenes(
-        self, points: Tensor, state: Tensor, action: Tensor, generator: torch.Generator
+        self, points: Tensor, state: Tensor, action: Tensor, a: Tensor, b: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Moves each scene of n by an affine map of its own.
+        """Moves n scenes by affine maps: A (n, 3, 3) and b (n, 1, 3), or one map for all.
 
         Points and the positions in a state move together, and the displacement that an action
         begins with turns and stretches with them: the scene stays one of the same task. Rotations
         turn by the rotation nearest to the map. Takes and returns points (n, L, N, P), state
         (n, L, S) and action (n, K, A): L = To and K = H for windows, L = K = T for a demonstration.
         """
-        a, b = sample_affine_maps(len(points), self.center, generator)
-        a, b = a.to(points.device), b.to(points.device)
+        n = len(points)
+        a, b = a.expand(n, 3, 3).to(points.device), b.expand(n, 1, 3).to(points.device)
 
         moved_points = map_positions(positions(points), a, b)  # (n, L, N, 3)
         points = torch.cat([moved_points, points[..., 3:]], dim=-1)  # features stay as they are

@@ -54,6 +54,41 @@ from simulator import Environment, Simulator, check_task, collect, evaluation_se
 EVALUATION_SEED = 0  # of the goals; the same for every seed of training
 EPISODES_A_JOB = 10  # side by side in one process; with another number other noise is drawn
 
+# ---- What may be read in place of a demonstration ------------------------------------------------
+#
+# Each takes a demonstration, as `WindowSampler.demonstration` gives it, and returns one of the same
+# shapes. What a policy loses by one of them tells what it reads.
+
+
+def zeros(demonstration: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Nothing of a demonstration."""
+    return {name: torch.zeros_like(x) for name, x in demonstration.items()}
+
+
+def last_frame(demonstration: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The last frame in the place of each: how it ends, but not how it comes to that."""
+    return {name: x[:, -1:].expand_as(x) for name, x in demonstration.items()}
+
+
+def without_actions(demonstration: dict[str, Tensor]) -> dict[str, Tensor]:
+    """What was seen, but not what was done: zeros in the place of the actions."""
+    return {**demonstration, "demo_action": torch.zeros_like(demonstration["demo_action"])}
+
+
+def shuffled_frames(demonstration: dict[str, Tensor]) -> dict[str, Tensor]:
+    """All frames in another order, which is the same for all demonstrations of one length."""
+    T = demonstration["demo_action"].shape[1]
+    order = torch.randperm(T, generator=torch.Generator().manual_seed(0))
+    return {name: x[:, order.to(x.device)] for name, x in demonstration.items()}
+
+
+DEMONSTRATION_CONTROLS = {
+    "zeros": zeros,
+    "last-frame": last_frame,
+    "no-actions": without_actions,
+    "shuffled": shuffled_frames,
+}
+
 # ---- Rollouts ------------------------------------------------------------------------------------
 
 
@@ -64,7 +99,7 @@ def rollout(
     sampler: WindowSampler,
     text: Tensor,
     generator: torch.Generator,
-    zero_demonstration: bool = False,
+    demonstration_control: str | None = None,
     stop_at_success: bool = False,
     on_steps: Callable[[int], None] | None = None,
 ) -> list[list[bool]]:
@@ -79,7 +114,8 @@ def rollout(
         sampler: of the task's demonstrations, from which one is drawn for each rollout.
         text: instruction feature, (text_dim,).
         generator: draws demonstrations and noise; on the CPU.
-        zero_demonstration: the policy reads zeros in place of its demonstration.
+        demonstration_control: what the policy reads in place of its demonstration, a key of
+            DEMONSTRATION_CONTROLS; None: the demonstration.
         stop_at_success: an episode ends at its first success, and not when it is over.
         on_steps: called with the number of steps that the episodes took since its last call.
 
@@ -96,8 +132,8 @@ def rollout(
         sampler.demonstration(sampler.sample_episode(generator)) for _ in environments
     ]
     for demonstration in demonstrations:
-        if zero_demonstration:
-            demonstration = {name: torch.zeros_like(x) for name, x in demonstration.items()}
+        if demonstration_control is not None:
+            demonstration = DEMONSTRATION_CONTROLS[demonstration_control](demonstration)
         with torch.no_grad():
             contexts.append(policy.encode_demo(text[None], **demonstration))
 
@@ -290,7 +326,7 @@ def evaluate_checkpoint(
     workers: int | None = None,
     device: str | torch.device = "cpu",
     n_demonstrations: int | None = None,
-    zero_demonstration: bool = False,
+    demonstration_control: str | None = None,
     known_goals: bool = False,
     stop_at_success: bool = False,
     config_overrides: dict[str, Any] | None = None,
@@ -308,7 +344,8 @@ def evaluate_checkpoint(
         workers: processes; None: one a core.
         device: where the policy runs.
         n_demonstrations: use only the first so many of each recording; None: all.
-        zero_demonstration: the policy reads zeros in place of its demonstration.
+        demonstration_control: what the policy reads in place of its demonstration, a key of
+            DEMONSTRATION_CONTROLS; None: the demonstration.
         known_goals: roll out on the demonstrations' goals, at most `episodes` of them, each once.
         stop_at_success: an episode ends at its first success; it is quicker.
         config_overrides: of the policy's configuration, see `inference_overrides`.
@@ -332,7 +369,7 @@ def evaluate_checkpoint(
                     "n_demonstrations": n_demonstrations,
                     "text": text[task].cpu().numpy(),  # tensors would be shared, not copied
                     "seeds": seeds[start : start + EPISODES_A_JOB],
-                    "zero_demonstration": zero_demonstration,
+                    "demonstration_control": demonstration_control,
                     "stop_at_success": stop_at_success,
                 }
             )
@@ -369,7 +406,7 @@ def rollout_job(
     n_demonstrations: int | None,
     text: np.ndarray,
     seeds: list[int],
-    zero_demonstration: bool,
+    demonstration_control: str | None,
     stop_at_success: bool,
 ) -> list[list[bool]]:
     """`rollout` of the episodes of these seeds, of one task, in a worker process."""
@@ -391,7 +428,7 @@ def rollout_job(
         sampler=worker_state["sampler"],
         text=torch.from_numpy(text).to(device),
         generator=torch.Generator().manual_seed(seeds[0]),
-        zero_demonstration=zero_demonstration,
+        demonstration_control=demonstration_control,
         stop_at_success=stop_at_success,
         on_steps=partial(report_progress, task),
     )
@@ -419,7 +456,7 @@ def action_error(
     text: Tensor,
     *,
     demonstrations: WindowSampler | None = None,
-    zero_demonstration: bool = False,
+    demonstration_control: str | None = None,
     seed: int = 0,
 ) -> ActionError:
     """How far drawn actions are from an expert's on held-out episodes.
@@ -434,7 +471,8 @@ def action_error(
         heldout_sampler: of the episodes to judge by.
         text: instruction feature, (text_dim,).
         demonstrations: one of its episodes is the reference demonstration; None: `train_sampler`.
-        zero_demonstration: the policy reads zeros in place of its demonstration.
+        demonstration_control: what the policy reads in place of its demonstration, a key of
+            DEMONSTRATION_CONTROLS; None: the demonstration.
         seed: of reference demonstrations and noise.
     """
     demonstrations = demonstrations or train_sampler
@@ -446,8 +484,8 @@ def action_error(
     for episode in heldout_sampler.episodes:
         demonstration = demonstrations.demonstration(demonstrations.sample_episode(generator))
         demonstration = {name: x.to(device) for name, x in demonstration.items()}
-        if zero_demonstration:
-            demonstration = {name: torch.zeros_like(x) for name, x in demonstration.items()}
+        if demonstration_control is not None:
+            demonstration = DEMONSTRATION_CONTROLS[demonstration_control](demonstration)
         context = policy.encode_demo(text[None], **demonstration)
 
         newest = torch.arange(episode.start, episode.stop, Ta)[:, None]  # (n, 1) frames
@@ -473,7 +511,7 @@ def evaluate_heldout(
     heldout_samplers: dict[str, WindowSampler],
     text: dict[str, Tensor],
     *,
-    zero_demonstration: bool = False,
+    demonstration_control: str | None = None,
     swap_demonstrations: bool = False,
 ) -> dict[str, ActionError]:
     """`action_error` of each task that has held-out episodes.
@@ -488,7 +526,7 @@ def evaluate_heldout(
             heldout_sampler,
             text[task],
             demonstrations=demonstrations[task],
-            zero_demonstration=zero_demonstration,
+            demonstration_control=demonstration_control,
         )
         for task, heldout_sampler in heldout_samplers.items()
     }
@@ -711,7 +749,11 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--split", choices=("base", "novel", "all"), default="base", help="which of its tasks")
     add("--task", nargs="+", help="only these tasks, of any suite")
     add("--data", default="data", help="folder of the demonstrations (default: data)")
-    add("--demonstrations", type=int, default=10, help="demonstrations a task (default: 10)")
+    add(
+        "--demonstrations",
+        type=int,
+        help="demonstrations a task (default: 10; 5 where goals are hidden)",
+    )
     add("--episodes", type=int, default=20, help="episodes a task (default: 20)")
     add("--top", type=int, default=0, help="all checkpoints of a run, and the mean of the best TOP")
     inputs = ("demonstration", "instruction")
@@ -719,6 +761,13 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "--swap", nargs="+", choices=inputs, default=[], help="measure also with another task's own"
     )
     add("--without", nargs="+", choices=inputs, default=[], help="zeros in the place of these")
+    add(
+        "--controls",
+        nargs="+",
+        choices=tuple(DEMONSTRATION_CONTROLS),
+        default=[],
+        help="measure also with only a part of the demonstration",
+    )
     add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
     add("--known-goals", action="store_true", help="those of the demonstrations, not new ones")
     add(
@@ -741,7 +790,7 @@ def check_flags(args: argparse.Namespace) -> None:
         ("episodes", args.episodes, 1),
         ("top", args.top, 0),
     ):
-        if value < least:
+        if value is not None and value < least:
             raise UserError(f"--{name} is {value}: use at least {least}")
     evaluation_seed(args.seed, args.episodes - 1)  # refuses what is out of range
     if args.gif:
@@ -839,28 +888,35 @@ class Measurement:
     checkpoint: Path
     recordings: dict[str, Path]
     text: dict[str, Tensor]
+    demonstration_control: str | None = None  # see DEMONSTRATION_CONTROLS
 
 
 def choose_measurements(
     runs: list[list[Checkpoint]],
     recordings: dict[str, Path],
     text: dict[str, Tensor],
-    swap: Sequence[str],
+    args: argparse.Namespace,
 ) -> list[Measurement]:
-    """Every checkpoint with each task's own inputs, and each run's last one with swapped ones."""
+    """Every checkpoint with each task's own inputs, and each run's last one with other ones."""
+    control = "zeros" if "demonstration" in args.without else None
     measurements = [
-        Measurement(checkpoint.label, checkpoint.path, recordings, text)
+        Measurement(checkpoint.label, checkpoint.path, recordings, text, control)
         for checkpoint in chain(*runs)
     ]
     for run in runs:
         last = run[-1]
-        for part in swap:
+        for part in args.controls:
+            measurements.append(
+                Measurement(f"{last.label}, {part}", last.path, recordings, text, part)
+            )
+        for part in args.swap:
             measurements.append(
                 Measurement(
                     label=f"{last.label}, {part} of another task",
                     checkpoint=last.path,
                     recordings=of_next_task(recordings) if part == "demonstration" else recordings,
                     text=of_next_task(text) if part == "instruction" else text,
+                    demonstration_control=control,
                 )
             )
     return measurements
@@ -963,7 +1019,7 @@ def measure(
         file.unlink()
 
     outcomes = {}
-    for measurement in choose_measurements(runs, recordings, text, args.swap):
+    for measurement in choose_measurements(runs, recordings, text, args):
         outcomes[measurement.label] = evaluate_checkpoint(
             checkpoint=measurement.checkpoint,
             simulator=simulator,
@@ -974,7 +1030,7 @@ def measure(
             workers=args.workers,
             device=device,
             n_demonstrations=args.demonstrations,
-            zero_demonstration="demonstration" in args.without,
+            demonstration_control=measurement.demonstration_control,
             known_goals=args.known_goals,
             stop_at_success=args.stop_at_success,
             config_overrides=inference_overrides(args),
@@ -1020,6 +1076,8 @@ def main(argv: list[str] | None = None) -> None:
     if suite == "own":
         raise UserError("a policy of own recordings has no simulator to be measured in")
     simulator = simulator_of(suite)
+    if args.demonstrations is None:
+        args.demonstrations = simulator.demonstrations
     tasks = choose_tasks(args, simulator, suite, info.get("adapted_to"))
     check_together(list(chain(*runs)), tasks)
     if args.swap and len(tasks) < 2:

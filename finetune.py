@@ -53,7 +53,6 @@ from simulator import (
 LEARNING_RATES = {"vision": 1e-5, "diffusion": 3e-5, "other": 1e-4}  # AdamW's, by part
 PAPER_LEARNING_RATE = 1e-4  # of the meta-training that they belong to
 BATCH = {"paper": 108, "small": 64, "tiny": 16}  # windows a step, by preset
-COLLECTED = 10  # demonstrations of a simulator's task; of a file all are used
 
 
 @dataclass(frozen=True)
@@ -562,8 +561,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         for suspicion in suspicions(recording):
             print(f"{file}: {suspicion}", flush=True)
     simulated = recording is None or made_by_simulator(recording)
-    if recording is None and settings.demonstrations is None:
-        settings = replace(settings, demonstrations=COLLECTED)
 
     # The policy to start from
     checkpoint = choose_checkpoint(args, simulated)
@@ -580,6 +577,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     simulator = simulator_of(suite) if simulated else None
     if recording is None:
         tasks = choose_tasks(args.task, simulator, suite)
+        if settings.demonstrations is None:  # of a file all are used
+            settings = replace(settings, demonstrations=simulator.demonstrations)
     else:
         check_recording(recording, file, args.task, simulator)
         tasks = [recording.task]

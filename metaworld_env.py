@@ -245,7 +245,11 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray:
         """Returns a picture (240, 240, 3) uint8 from the camera of the point clouds."""
-        picture = self.camera.render(self.sawyer_env.data, RENDER_PIXELS, RENDER_PIXELS)
+        return self.picture(self.camera)
+
+    def picture(self, camera: RayCastCamera) -> np.ndarray:
+        """Returns what a camera of `make_camera` sees, upright, (240, 240, 3) uint8."""
+        picture = camera.render(self.sawyer_env.data, RENDER_PIXELS, RENDER_PIXELS)
         return picture[::-1, ::-1].copy()  # Meta-World's corner cameras hang upside down
 
     def close(self) -> None:
@@ -267,6 +271,7 @@ class MetaWorld:
     instructions: ClassVar[dict[str, str]] = INSTRUCTIONS
     recipe: ClassVar[dict] = RECIPE
     packages: ClassVar[tuple[str, ...]] = ("metaworld", "mujoco")
+    demonstrations: ClassVar[int] = 10
 
     def tasks(self, suite: str) -> tuple[list[str], list[str]]:
         """Returns the (base, novel) tasks of "ml10" or "ml45"."""

@@ -14,8 +14,10 @@ Letters: N points of an observation, S state dim, A action dim, T frames of an e
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -66,8 +68,11 @@ class Simulator(Protocol):
 
     name: str
     instructions: dict[str, str]  # task -> what the robot is told; its order decides the seeds
-    recipe: dict[str, Any]  # how recordings are made: "simulator" (the name), "num_points", ...
+    # How recordings are made: "simulator" (the name), "num_points" and more. With "success": "at
+    # the end" an expert's episode is kept only if its last step is a success, too.
+    recipe: dict[str, Any]
     packages: Sequence[str]  # whose versions are written into recordings
+    demonstrations: int  # of a task, unless a command says otherwise
     episode_steps: int  # after so many steps an episode is truncated
 
     def tasks(self, suite: str) -> tuple[list[str], list[str]]:
@@ -77,20 +82,38 @@ class Simulator(Protocol):
         """Makes an environment of a task whose clouds have `num_points` points."""
 
 
-def meta_world() -> Simulator:
-    """Returns Meta-World, which is imported only here."""
+def import_simulator(module: str) -> ModuleType:
+    """Imports a file that needs Meta-World; UserError says what to install where it is missing."""
     try:
-        from metaworld_env import MetaWorld
+        return import_module(module)
     except ModuleNotFoundError as error:
         if error.name not in ("gymnasium", "metaworld", "mujoco", "scipy"):
             raise
         raise UserError(
             f"the package {error.name} is not installed: pip install -r requirements.txt"
         ) from error
-    return MetaWorld()
 
 
-SIMULATORS: dict[str, Callable[[], Simulator]] = {"ml10": meta_world, "ml45": meta_world}
+def meta_world() -> Simulator:
+    """Returns Meta-World, which is imported only here."""
+    return import_simulator("metaworld_env").MetaWorld()
+
+
+def hidden_goals() -> Simulator:
+    """Returns Meta-World's skills with hidden goals, which are imported only here."""
+    return import_simulator("hidden_goals").HiddenGoals()
+
+
+SIMULATORS: dict[str, Callable[[], Simulator]] = {
+    "ml10": meta_world,
+    "ml45": meta_world,
+    "goals-reach": hidden_goals,
+    "goals-push": hidden_goals,
+    "goals-pick-place": hidden_goals,
+    "goals-reach-validation": hidden_goals,
+    "goals-push-validation": hidden_goals,
+    "goals-pick-place-validation": hidden_goals,
+}
 
 
 def simulator_of(suite: str) -> Simulator:
@@ -273,7 +296,8 @@ def missing_tasks(
 def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, seed: int) -> None:
     """Records `episodes` successful episodes of one task into a file."""
     start = time.perf_counter()
-    env = simulator.make(task, simulator.recipe["num_points"])
+    recipe = simulator.recipe
+    env = simulator.make(task, recipe["num_points"])
     most_attempts = min(ATTEMPTS_PER_EPISODE * episodes, seeds_of_a_task(simulator))
 
     recorded, episode_seeds, success_frames = [], [], []  # of each successful episode
@@ -286,7 +310,7 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
             )
         drawn_seed = demonstration_seed(simulator, task, seed, attempts)
         attempts += 1
-        episode = record_episode(env, drawn_seed)
+        episode = record_episode(env, drawn_seed, at_end=recipe.get("success") == "at the end")
         if episode is None:
             continue
         arrays, success_frame = episode
@@ -304,7 +328,7 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
         action=np.concatenate([arrays["action"] for arrays in recorded]),
         episode_ends=np.cumsum([len(arrays["action"]) for arrays in recorded]),
         meta={
-            **simulator.recipe,
+            **recipe,
             "made_by": "simulator.collect",
             "seed": seed,
             "episode_seeds": episode_seeds,
@@ -317,11 +341,14 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
     save_demonstrations(path, demonstrations)
 
 
-def record_episode(env: Environment, seed: int) -> tuple[dict[str, np.ndarray], int] | None:
+def record_episode(
+    env: Environment, seed: int, at_end: bool = False
+) -> tuple[dict[str, np.ndarray], int] | None:
     """Lets the expert act for one episode.
 
     Returns its "points" (T, N, P) float16, "state" (T, S) and "action" (T, A) float32, each of the
-    moment before the step, and the frame of its first success; None if it had none.
+    moment before the step, and the frame of its first success; None if it had none, or with
+    `at_end` if its last step was none.
     """
     points, state, actions = [], [], []  # of each frame
     success_frame = None
@@ -337,7 +364,7 @@ def record_episode(env: Environment, seed: int) -> tuple[dict[str, np.ndarray], 
         if info["success"] and success_frame is None:
             success_frame = len(actions) - 1
 
-    if success_frame is None:
+    if success_frame is None or (at_end and not info["success"]):
         return None
     arrays = {"points": np.stack(points), "state": np.stack(state), "action": np.stack(actions)}
     return arrays, success_frame
@@ -353,7 +380,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--task", help="only this task")
     parser.add_argument("--data", default="data", help="folder of the files (data)")
-    parser.add_argument("--episodes", type=int, default=10, help="successful ones a task (10)")
+    parser.add_argument(
+        "--episodes", type=int, help="successful ones a task (10; 5 where goals are hidden)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of objects and goals, 0 to 999 (0)")
     parser.add_argument("--workers", type=int, help="processes (one a core)")
     return parser.parse_args(argv)
@@ -369,7 +398,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         tasks = base + novel
 
     paths = collect(
-        simulator, tasks, args.data, episodes=args.episodes, seed=args.seed, workers=args.workers
+        simulator,
+        tasks,
+        args.data,
+        episodes=simulator.demonstrations if args.episodes is None else args.episodes,
+        seed=args.seed,
+        workers=args.workers,
     )
 
     rows = [["task", "episodes", "expert", "frames", "seconds", "MB"]]

@@ -97,11 +97,18 @@ class Settings:
     )
     late_fraction: float = setting(0.0, "fraction of late windows", least=0, most=1)
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
+    one_map: bool = setting(False, "of a task's scenes all alike, where a place tells the task")
     instruction_dropout: float = setting(
         0.0, "fraction of the batches without instruction", least=0, most=1
     )
     task_dropout: float = setting(
         0.0, "fraction of the inner steps without instruction and demonstration", least=0, most=1
+    )
+    base_tasks: int | None = setting(
+        None, "base tasks to train on, drawn by the seed (default: all)", least=1
+    )
+    tasks_per_step: int | None = setting(
+        None, "tasks of each outer step, drawn at random (default: all)", least=1
     )
     demonstrations: int | None = setting(10, "demonstrations a task (own: all)", least=1)
     held_out: int = setting(
@@ -110,6 +117,7 @@ class Settings:
     checkpoint_every: int = setting(3_600, "steps between EMA checkpoints", least=1)
     evaluate_every: int = setting(3_600, "steps between evaluations", least=1)
     episodes: int = setting(20, "evaluation episodes a task; 0: never evaluate", least=0)
+    evaluate_on: str = setting("base", "tasks to evaluate on", choices=("base", "novel"))
 
     def __post_init__(self) -> None:
         common.check_settings(self)
@@ -141,6 +149,23 @@ SETTINGS = {
 # fmt: on
 
 
+# What a suite of hidden goals changes, in every preset. All goals have the same instruction, so the
+# demonstration is read without leaving that out; moving each scene by a map of its own would hide
+# the goal; and on novel goals a policy is measured without adapting it.
+HIDDEN_GOALS = {
+    "base_tasks": 160,
+    "demonstrations": 3,  # one to read, one for the support windows, one for the query windows
+    "tasks_per_step": 16,
+    "augment": False,
+    "instruction_dropout": 0.0,
+    "after_success": None,
+    "late_fraction": 0.0,
+    "evaluate_on": "novel",
+    "episodes": 5,
+}
+SUITE_SETTINGS = {f"goals-{skill}": HIDDEN_GOALS for skill in ("reach", "push", "pick-place")}
+
+
 # ---- Algorithm 1 ---------------------------------------------------------------------------------
 
 
@@ -155,6 +180,9 @@ def task_batch(
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
+    The first windows are the support set, and where there are episodes enough they are of others
+    than the query windows.
+
     Where the instruction names the task, a policy need read nothing else. In a fraction of the
     batches (`instruction_dropout`) zeros therefore take its place, and only the demonstration tells
     the task. Where an inner step follows (`inner`), in a fraction of them (`task_dropout`) the
@@ -167,7 +195,7 @@ def task_batch(
     generator = torch.Generator().manual_seed(int(seed_of_batch))
     batch = {
         "text": text[None],
-        **sampler.batch(n, generator),
+        **sampler.batch(n, generator, support=settings.support),
         **policy.draw_noise_and_timesteps(n, generator),
     }
 
@@ -229,6 +257,14 @@ def maml_gradient(
         vectorize=vectorize,
     )
     return gradients, losses.mean()
+
+
+def tasks_of_step(step: int, tasks: int, settings: Settings) -> list[int]:
+    """The tasks of an outer step, by their places: all, or as many as the settings say."""
+    if settings.tasks_per_step is None or settings.tasks_per_step >= tasks:
+        return list(range(tasks))
+    rng = np.random.default_rng((settings.seed, step))
+    return sorted(rng.choice(tasks, settings.tasks_per_step, replace=False).tolist())
 
 
 def learning_rate(step: int, settings: Settings) -> float:
@@ -294,7 +330,7 @@ def meta_train(
         UserError: the loss or its gradient is not finite. The step changed nothing then.
     """
     policy = state.policy
-    my_tasks = list(enumerate(samplers))[rank::world]
+    all_tasks = list(samplers)
 
     # Where all demonstrations have one length several tasks can run at once. As the shapes are the
     # same in every step then, on a GPU either kind of step can also be one CUDA graph.
@@ -308,8 +344,11 @@ def meta_train(
 
     for step in range(state.step, settings.steps):  # lines 2, 22
         inner = step >= settings.pretrain_steps
+        places = tasks_of_step(step, len(all_tasks), settings)
+        my_places = places[rank::world]
         batches = []
-        for i, task in my_tasks:  # lines 3 to 6, 9
+        for i in my_places:  # lines 3 to 6, 9
+            task = all_tasks[i]
             batch = task_batch(
                 policy,
                 samplers[task],
@@ -336,7 +375,7 @@ def meta_train(
         # The mean over all tasks: that of the processes' means, weighted by their numbers of tasks
         if world > 1:
             for x in (*figures.values(), *gradients.values()):
-                dist.all_reduce(x.mul_(len(my_tasks) / len(samplers)))
+                dist.all_reduce(x.mul_(len(my_places) / len(places)))
 
         figures["gradient_norm"] = torch.nn.utils.get_total_norm(gradients.values())
         if not torch.isfinite(figures["loss"] + figures["gradient_norm"]):
@@ -462,6 +501,7 @@ def fingerprint(samplers: dict[str, WindowSampler]) -> str:
     for sampler in samplers.values():
         sha.update(f"{sampler.task} {sampler.instruction}".encode())
         if sampler.augment:
+            sha.update(f"{sampler.one_map}".encode())
             sha.update(f"{sampler.positions_in_state} {sampler.center.tolist()}".encode())
             if sampler.rotation_near is not None:
                 sha.update(f"{sampler.rotation_near.tolist()}".encode())
@@ -481,6 +521,7 @@ class Evaluation:
     settings: Settings
     simulator: Simulator | None  # None: own recordings, which are rolled out nowhere
     recordings: dict[str, Path]
+    n_demonstrations: int | None  # of each recording, one of which is the reference; None: all
     text: dict[str, Tensor]
     workers: int | None
     device: torch.device
@@ -503,12 +544,12 @@ class Evaluation:
                     checkpoint=self.folder / f"ema-{step:05d}.pt",
                     simulator=self.simulator,
                     recordings=self.recordings,
-                    text=self.text,
+                    text={task: self.text[task] for task in self.recordings},
                     episodes=settings.episodes,
                     seed=evaluate.EVALUATION_SEED,
                     workers=self.workers,
                     device=self.device,
-                    n_demonstrations=settings.demonstrations - settings.held_out,
+                    n_demonstrations=self.n_demonstrations,
                 )
         except KeyboardInterrupt:
             raise KeyboardInterrupt("all is saved, add --resume to go on") from None
@@ -582,7 +623,7 @@ def heldout_controls(
     if policy.reads_demonstration and len(train_samplers) > 1:
         rows["another task's demonstration"] = mean_of_tasks(measure(swap_demonstrations=True))
     if policy.reads_demonstration:
-        rows["zeros for a demonstration"] = mean_of_tasks(measure(zero_demonstration=True))
+        rows["zeros for a demonstration"] = mean_of_tasks(measure(demonstration_control="zeros"))
     if settings.maml == "off":
         return rows
 
@@ -625,7 +666,8 @@ def report_training(
             folder,
             {"last checkpoint": outcomes},
             {
-                "title": f"{settings.suite}, base tasks, {settings.preset}, {policy}",
+                "title": f"{settings.suite}, {settings.evaluate_on} tasks, "
+                f"{settings.preset}, {policy}",
                 "seed": evaluate.EVALUATION_SEED,
                 "episodes a task": settings.episodes,
                 "training": f"{seconds / 60:.1f} min",
@@ -713,6 +755,17 @@ def choose_architecture(args: argparse.Namespace, preset: str) -> PolicyConfig:
     return config
 
 
+def draw_base_tasks(base_tasks: Sequence[str], settings: Settings) -> list[str]:
+    """The tasks to train on: all of a suite's base tasks, or as many as the settings say."""
+    n = len(base_tasks) if settings.base_tasks is None else settings.base_tasks
+    if n > len(base_tasks):
+        raise UserError(
+            f"--base-tasks is {n}: {settings.suite} has {len(base_tasks)}, use at most that"
+        )
+    drawn = np.random.default_rng(settings.seed).choice(len(base_tasks), n, replace=False)
+    return [base_tasks[i] for i in sorted(drawn)]
+
+
 def build_empty(config: PolicyConfig) -> DAMIPolicy:
     """A policy whose weights are neither drawn nor stored, to ask what it is like."""
     with torch.device("meta"):
@@ -723,7 +776,7 @@ def choose_settings(
     args: argparse.Namespace, preset: str, suite: str, config: PolicyConfig
 ) -> Settings:
     """The preset's settings, with the flags that were given."""
-    settings = replace(SETTINGS[preset], suite=suite)
+    settings = replace(SETTINGS[preset], suite=suite, **SUITE_SETTINGS.get(suite, {}))
     if suite == "own":  # all demonstrations, and no simulator to be rolled out in
         settings = replace(settings, demonstrations=None, episodes=0)
     if not build_empty(config).reads_demonstration:  # then the instruction alone tells the task
@@ -819,6 +872,7 @@ def make_samplers(
             after_success=settings.after_success,
             late_fraction=settings.late_fraction,
             augment=settings.augment,
+            one_map=settings.one_map,
         )
         if heldout is not None:
             heldout_samplers[task] = WindowSampler(heldout, config)
@@ -831,6 +885,7 @@ def run(
     config: PolicyConfig,
     simulator: Simulator | None,
     paths: dict[str, Path],
+    evaluated_paths: dict[str, Path],
     folder: Path,
     provenance: dict[str, Any],
     device: torch.device,
@@ -844,7 +899,8 @@ def run(
         settings: what to train with.
         config: the architecture, whose dimensions will be those of the recordings.
         simulator: where to evaluate; None: nowhere.
-        paths: task -> its recording.
+        paths: task -> its recording, of the tasks to train on.
+        evaluated_paths: the same of the tasks to evaluate on.
         folder: of the run.
         provenance: what stands beside every result.
         device, rank, world: of this process, see `join_processes`.
@@ -873,13 +929,17 @@ def run(
     if args.resume:
         saved = restore(folder / "last.pt", state, settings, data)
         text_weights, provenance = saved["text_weights"], saved["provenance"]
+    instructions = {task: recording.instruction for task, recording in recordings.items()}
+    for task, path in evaluated_paths.items():
+        instructions.setdefault(task, load_demonstrations(path).instruction)
     text, text_weights = evaluate.instruction_features(
-        {task: recording.instruction for task, recording in recordings.items()},
-        weights=args.clip_weights,
-        identity=text_weights,
-        device=device,
+        instructions, weights=args.clip_weights, identity=text_weights, device=device
     )
     provenance = {"text weights": text_weights, **provenance}
+
+    n_demonstrations = None
+    if settings.evaluate_on == "base" and settings.demonstrations is not None:
+        n_demonstrations = settings.demonstrations - settings.held_out
 
     # What every checkpoint says, what last.pt says besides, and where results are measured
     checkpoint_info = {
@@ -894,7 +954,8 @@ def run(
         folder=folder,
         settings=settings,
         simulator=simulator,
-        recordings=paths,
+        recordings=evaluated_paths,
+        n_demonstrations=n_demonstrations,
         text=text,
         workers=args.workers,
         device=device,
@@ -953,13 +1014,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     # Own recordings, or the base tasks of a suite
     if args.data and not args.suite:
         suite, simulator = "own", None
+        settings = choose_settings(args, preset, suite, config)
         paths = own_recordings(Path(args.data))
+        novel_paths = {}
     else:
         suite = args.suite or "ml10"
         simulator = simulator_of(suite)
-        base_tasks, _ = simulator.tasks(suite)
-        paths = {task: Path(args.data or "data") / f"{task}.npz" for task in base_tasks}
-    settings = choose_settings(args, preset, suite, config)
+        settings = choose_settings(args, preset, suite, config)
+        base_tasks, novel_tasks = simulator.tasks(suite)
+        data = Path(args.data or "data")
+        paths = {task: data / f"{task}.npz" for task in draw_base_tasks(base_tasks, settings)}
+        novel_paths = {}  # if they are evaluated on
+        if settings.evaluate_on == "novel" and settings.episodes > 0:
+            novel_paths = {task: data / f"{task}.npz" for task in novel_tasks}
     name = preset if config.policy == "dami" else f"{config.policy}-{preset}"
     trained_on = suite if simulator else f"own-{Path(args.data).resolve().name}"
     folder = Path(args.out or f"runs/{trained_on}-{name}-seed{settings.seed}")
@@ -972,13 +1039,11 @@ def main(argv: Sequence[str] | None = None) -> None:
             print(f"preset {name} on {where}, {tasks}, in {folder}", flush=True)
             check_folder(folder, args.resume)
             if simulator is not None:
-                collect(
-                    simulator,
-                    list(paths),
-                    Path(args.data or "data"),
-                    episodes=settings.demonstrations,
-                    workers=args.workers,
-                )
+                for tasks, episodes in (
+                    (list(paths), settings.demonstrations),
+                    (list(novel_paths), simulator.demonstrations),
+                ):
+                    collect(simulator, tasks, data, episodes=episodes, workers=args.workers)
         if world > 1:
             dist.barrier()
         run(
@@ -987,6 +1052,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             config=config,
             simulator=simulator,
             paths=paths,
+            evaluated_paths=novel_paths or paths,
             folder=folder,
             provenance=common.provenance("train.py", argv, device),
             device=device,

@@ -336,7 +336,7 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
             n_demonstrations=2,
             text=np.zeros(512, np.float32),
             seeds=[simulator.evaluation_seed(0, episode)],
-            zero_demonstration=False,
+            demonstration_control=None,
             stop_at_success=True,
         )
         return np.stack(frames)
@@ -511,7 +511,7 @@ def test_the_policy_reads_the_older_frame_first_and_the_newest_last(monkeypatch)
 
 def test_a_demonstration_that_is_left_out_of_a_rollout_is_all_zeros(monkeypatch):
     _, [shown], _ = walk(monkeypatch, Corridor(9))
-    _, [left_out], _ = walk(monkeypatch, Corridor(9), zero_demonstration=True)
+    _, [left_out], _ = walk(monkeypatch, Corridor(9), demonstration_control="zeros")
     assert shown["demo_points"].any() and shown["demo_action"].any()
     for part, x in shown.items():
         assert torch.equal(left_out[part], torch.zeros_like(x))
@@ -594,7 +594,9 @@ def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordi
     without = "--without demonstration instruction --episodes 2 --out without --n-action-steps 4"
     evaluate.main(command(run, recordings, without))
     [(_, text, options)] = calls
-    assert options["zero_demonstration"] and options["config_overrides"] == {"n_action_steps": 4}
+    assert options["demonstration_control"] == "zeros" and options["config_overrides"] == {
+        "n_action_steps": 4
+    }
     assert not any(feature.any() for feature in text.values())
     provenance = report_of("without")["provenance"]
     assert provenance["left out"] == "demonstration and instruction"
@@ -622,7 +624,7 @@ def test_what_the_command_line_says_reaches_the_rollouts(run, recordings, traine
         "workers": 2,
         "device": torch.device("cpu"),
         "n_demonstrations": 2,
-        "zero_demonstration": False,
+        "demonstration_control": None,
         "known_goals": True,
         "stop_at_success": True,
         "config_overrides": {"sampler": "ddim"},
@@ -932,7 +934,7 @@ def test_every_task_with_held_out_episodes_is_judged_by_its_own(trained, recordi
         )
         assert own[task] == alone.of_policy.tolist()
     assert own["touch-red"] != own["touch-green"]
-    swapped, without = errors(swap_demonstrations=True), errors(zero_demonstration=True)
+    swapped, without = errors(swap_demonstrations=True), errors(demonstration_control="zeros")
     assert own["touch-red"] != swapped["touch-red"] != without["touch-red"] != own["touch-red"]
     del heldout_samplers["touch-red"]
     assert errors() == {"touch-green": own["touch-green"]}

@@ -61,6 +61,7 @@ class ToySimulator:
         f"touch-{color}": f"Touch the {color} ball." for color in COLORS
     }
     packages: ClassVar[tuple] = ()
+    demonstrations: ClassVar[int] = 10
 
     @property
     def recipe(self):

@@ -1,0 +1,176 @@
+"""Tasks that no observation names: Meta-World's skills, each with goals that are hidden.
+
+    python simulator.py --suite goals-reach     # demonstrations of all its goals into data/
+    python train.py --suite goals-reach         # trains on 160 goals, measures on 20 new ones
+
+In Meta-World's suites the scene tells the task: a policy that ignores its demonstration can still
+succeed. Here a task is one goal of one skill, as in Meta-World's own ML1, and the goal's marker is
+taken out of the cloud. All goals of a skill have the same instruction, and an episode begins at a
+place that says nothing of the goal. What is left to tell the goal is the demonstration, and the
+windows of an inner step.
+
+Three things differ from ML1. Goals lie on a wide area, so that the way to one does not pass
+another. The hand begins at another place in every episode: from one place for all, a replay of the
+demonstration's actions would do. And the object begins in a region so small that Meta-World's rule,
+by which object and goal are 15 cm apart, never rejects a start: a rejected start would tell of the
+goal.
+
+All lengths are metres, in the world frame.
+"""
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+
+from metaworld_env import INSTRUCTIONS, RECIPE, MetaWorldPointCloudEnv
+
+# ---- Goals and starts ----------------------------------------------------------------------------
+
+SKILLS = ("reach", "push", "pick-place")
+# The goals of each skill: to train on, to choose by, and to measure on. Task are called after them:
+# reach-goal-07, reach-validation-07, reach-novel-07.
+GOALS = {"goal": 320, "validation": 10, "novel": 20}
+
+# Where goals lie: in this box, and so far from the middle of where objects begin, horizontally.
+GOAL_LOW, GOAL_HIGH = (-0.30, 0.50, 0.05), (0.30, 0.90, 0.30)
+GOAL_DISTANCE = (0.21, 0.32)
+ON_TABLE = 0.02  # the height of the goals of push
+
+# Where the object and the hand begin, at most so far from a middle.
+OBJECT_MIDDLE, OBJECT_SPREAD = (0.0, 0.65), (0.05, 0.03)
+HAND_LOW, HAND_HIGH = (-0.15, 0.48, 0.12), (0.15, 0.72, 0.32)
+
+# Of the gripper and the puck, which are all that is seen, fewer rays show enough.
+CAMERA_PIXELS = 64
+NUM_POINTS = 64
+
+
+def split_name(task: str) -> tuple[str, str, int]:
+    """Splits a task's name: "pick-place-novel-03" -> ("pick-place", "novel", 3)."""
+    skill, kind, number = task.rsplit("-", 2)
+    return skill, kind, int(number)
+
+
+def names_of(skill: str, kind: str) -> list[str]:
+    """Returns the tasks of a skill that are of one kind, a key of GOALS."""
+    return [f"{skill}-{kind}-{number:02d}" for number in range(GOALS[kind])]
+
+
+def goal_of(task: str) -> np.ndarray:
+    """Returns the goal of a task (3,), which is drawn from its name."""
+    skill, _, _ = split_name(task)
+    rng = np.random.default_rng(zlib.crc32(task.encode()))
+    nearest, farthest = GOAL_DISTANCE
+    while True:
+        goal = rng.uniform(GOAL_LOW, GOAL_HIGH)
+        if nearest <= np.linalg.norm(goal[:2] - OBJECT_MIDDLE) <= farthest:
+            break
+    if skill == "push":
+        goal[2] = ON_TABLE
+    return goal
+
+
+def start_of(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where the object (2,) and the hand (3,) begin in the episode of this seed."""
+    rng = np.random.default_rng(seed)
+    spread = np.array(OBJECT_SPREAD)
+    return OBJECT_MIDDLE + rng.uniform(-spread, spread), rng.uniform(HAND_LOW, HAND_HIGH)
+
+
+# ---- Environment ---------------------------------------------------------------------------------
+
+
+class HiddenGoalEnv(MetaWorldPointCloudEnv):
+    """One goal of a skill, which the cloud does not show; `render` does.
+
+    Observations, actions and success are those of `MetaWorldPointCloudEnv`. An episode's seed
+    decides where object and hand begin, and the task where the goal is.
+
+    Args:
+        task: such as "reach-goal-07".
+        num_points: N of a cloud.
+        episode_steps: the length of an episode.
+    """
+
+    def __init__(self, task: str, num_points: int = NUM_POINTS, *, episode_steps: int):
+        skill, _, _ = split_name(task)
+        super().__init__(skill, num_points, episode_steps=episode_steps)
+        self.task = task
+        self.goal = goal_of(task)
+
+        # Meta-World clips the goal that its expert reads to the goal space, which is narrower than
+        # ours. It keeps the space of observations that follows from it, so that is dropped.
+        low, high = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 1.5, 1.0])
+        self.sawyer_env.goal_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
+        self.sawyer_env.__dict__.pop("sawyer_observation_space", None)
+
+        self.picture_camera = self.camera
+        marker = self.sawyer_env.model.site("goal")
+        color = marker.rgba.copy()
+        marker.rgba[3] = 0
+        self.camera = self.make_camera(CAMERA_PIXELS)  # does not see what is transparent now
+        marker.rgba[:] = color
+
+    def begin(self, seed: int) -> None:
+        """Begins the episode of this seed without casting rays."""
+        sawyer_env = self.sawyer_env
+        position, sawyer_env.hand_init_pos = start_of(seed)
+        height = sawyer_env.init_config["obj_init_pos"][2]
+        sawyer_env._freeze_rand_vec = True  # not drawn: object and goal are these
+        sawyer_env._last_rand_vec = np.array([*position, height, *self.goal])
+        self.expert_observation, _ = sawyer_env.reset()
+        mujoco.mj_forward(sawyer_env.model, sawyer_env.data)
+        self.steps = 0
+
+    def render(self) -> np.ndarray:
+        """Returns a picture (240, 240, 3) uint8, with the goal's marker in it."""
+        return self.picture(self.picture_camera)
+
+
+# ---- For simulator.py ----------------------------------------------------------------------------
+
+
+def all_tasks() -> Iterator[str]:
+    """The tasks of all skills, in the order that decides the seeds of demonstrations."""
+    for skill in SKILLS:
+        for kind in GOALS:
+            yield from names_of(skill, kind)
+
+
+@dataclass(frozen=True)
+class HiddenGoals:
+    """Skills with hidden goals as a `simulator.Simulator`."""
+
+    episode_steps: int = 100  # experts need 30 to 75
+    name: ClassVar[str] = "meta-world, hidden goals"
+    instructions: ClassVar[dict[str, str]] = {
+        task: INSTRUCTIONS[split_name(task)[0]] for task in all_tasks()
+    }
+    recipe: ClassVar[dict] = {
+        **RECIPE,
+        "simulator": name,
+        "camera": [*RECIPE["camera"][:2], CAMERA_PIXELS],
+        "num_points": NUM_POINTS,
+        "success": "at the end",
+    }
+    packages: ClassVar[tuple[str, ...]] = ("metaworld", "mujoco")
+    demonstrations: ClassVar[int] = 5
+
+    def tasks(self, suite: str) -> tuple[list[str], list[str]]:
+        """Returns the (base, novel) goals of "goals-SKILL".
+
+        In "goals-SKILL-validation" other goals stand in the place of the novel ones. Whatever is
+        chosen is chosen on those.
+        """
+        name = suite.removeprefix("goals-")
+        skill = name.removesuffix("-validation")
+        return names_of(skill, "goal"), names_of(skill, "novel" if name == skill else "validation")
+
+    def make(self, task: str, num_points: int) -> HiddenGoalEnv:
+        """Makes an environment of a task whose clouds have `num_points` points."""
+        return HiddenGoalEnv(task, num_points, episode_steps=self.episode_steps)
