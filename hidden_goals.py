@@ -21,19 +21,21 @@ All lengths are metres, in the world frame.
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import gymnasium
 import mujoco
 import numpy as np
 
-from metaworld_env import INSTRUCTIONS, RECIPE, MetaWorldPointCloudEnv
+from camera import RayCastCamera
+from metaworld_env import INSTRUCTIONS, RECIPE, RENDER_PIXELS, MetaWorldPointCloudEnv
 
 # ---- Goals and starts ----------------------------------------------------------------------------
 
 SKILLS = ("reach", "push", "pick-place")
-# The goals of each skill: to train on, to choose by, and to measure on. Task are called after them:
-# reach-goal-07, reach-validation-07, reach-novel-07.
+# The goals of each skill: to train on, to choose by, and to measure on. Tasks are called after
+# them: reach-goal-07, reach-validation-07, reach-novel-07.
 GOALS = {"goal": 320, "validation": 10, "novel": 20}
 
 # Where goals lie: in this box, and so far from the middle of where objects begin, horizontally.
@@ -48,6 +50,9 @@ HAND_LOW, HAND_HIGH = (-0.15, 0.48, 0.12), (0.15, 0.72, 0.32)
 # Of the gripper and the puck, which are all that is seen, fewer rays show enough.
 CAMERA_PIXELS = 64
 NUM_POINTS = 64
+
+# What pictures are drawn from, which show the goal.
+PICTURE_POSITION, PICTURE_LOOKAT = (0.35, 1.6, 0.75), (0.0, 0.66, 0.12)
 
 
 def split_name(task: str) -> tuple[str, str, int]:
@@ -109,12 +114,19 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         self.sawyer_env.goal_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
         self.sawyer_env.__dict__.pop("sawyer_observation_space", None)
 
-        self.picture_camera = self.camera
+        # The camera does not see what is transparent when it is made.
         marker = self.sawyer_env.model.site("goal")
         color = marker.rgba.copy()
         marker.rgba[3] = 0
-        self.camera = self.make_camera(CAMERA_PIXELS)  # does not see what is transparent now
+        self.camera = self.make_camera(CAMERA_PIXELS)
         marker.rgba[:] = color
+
+    @cached_property
+    def picture_camera(self) -> RayCastCamera:
+        """Faces the robot, whose arm hides half of the goals from Meta-World's corner."""
+        return RayCastCamera(
+            self.sawyer_env.model, position=PICTURE_POSITION, lookat=PICTURE_LOOKAT
+        )
 
     def begin(self, seed: int) -> None:
         """Begins the episode of this seed without casting rays."""
@@ -129,7 +141,7 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
 
     def render(self) -> np.ndarray:
         """Returns a picture (240, 240, 3) uint8, with the goal's marker in it."""
-        return self.picture(self.picture_camera)
+        return self.picture_camera.render(self.sawyer_env.data, RENDER_PIXELS, RENDER_PIXELS)
 
 
 # ---- For simulator.py ----------------------------------------------------------------------------

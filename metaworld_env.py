@@ -245,11 +245,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray:
         """Returns a picture (240, 240, 3) uint8 from the camera of the point clouds."""
-        return self.picture(self.camera)
-
-    def picture(self, camera: RayCastCamera) -> np.ndarray:
-        """Returns what a camera of `make_camera` sees, upright, (240, 240, 3) uint8."""
-        picture = camera.render(self.sawyer_env.data, RENDER_PIXELS, RENDER_PIXELS)
+        picture = self.camera.render(self.sawyer_env.data, RENDER_PIXELS, RENDER_PIXELS)
         return picture[::-1, ::-1].copy()  # Meta-World's corner cameras hang upside down
 
     def close(self) -> None:

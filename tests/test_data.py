@@ -603,6 +603,24 @@ def test_no_window_is_from_the_reference_demonstration_unless_it_is_the_only_one
     assert (alone["state"] == alone["demo_state"][0, 0]).all()
 
 
+@pytest.mark.parametrize("episodes", [3, 4, 7])
+def test_support_windows_are_of_other_episodes_than_query_windows(episodes):
+    recorded = recording((40,) * episodes)
+    recorded.state[:] = np.repeat(np.arange(episodes), 40)[:, None]
+    sampler = WindowSampler(recorded, SIZES)
+    used = []  # sets of episodes: of the reference, of support and of query windows
+    for seed in range(40):
+        batch = sampler.batch(60, seeded(seed), support=25)
+        of_window = batch["state"][:, 0, 0].tolist()
+        used.append(({batch["demo_state"][0, 0, 0].item()}, {*of_window[:25]}, {*of_window[25:]}))
+    for reference, support, query in used:
+        assert not reference & support and not reference & query and not support & query
+    for place in range(3):  # each episode takes each place
+        assert len(set().union(*(sets[place] for sets in used))) == episodes
+    two = WindowSampler(recorded.take(2), SIZES).batch(60, seeded(), support=25)
+    assert len(two["state"].unique()) == 1  # nothing is left to choose
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -743,6 +761,18 @@ def test_rotations_that_are_not_there_are_refused():
     with pytest.raises(RecordingError, match="not have 7 and 4 numbers"):
         replace(sound, action=sound.action[:, :4]).check()
     replace(sound, action=sound.action[:, :4], meta={"rotation_near_rad": [0, 3, 0]}).check()
+
+
+def test_one_map_moves_a_tasks_demonstration_and_windows_alike():
+    recorded = recording((40, 30))
+    recorded.meta["positions_in_state"] = 1
+    place = torch.tensor([0.1, 0.6, 0.2])  # in the world's frame, as a goal is
+    recorded.state[:, :3] = place
+    for one_map, places in ((True, 1), (False, 13)):
+        sampler = WindowSampler(recorded, SIZES, augment=True, one_map=one_map)
+        batch = sampler.batch(12, seeded())
+        moved = torch.cat([batch["state"][:, 0, :3], batch["demo_state"][:, 0, :3]])
+        assert len(torch.unique(moved, dim=0)) == places and not torch.isclose(moved, place).all()
 
 
 def test_colors_stay_as_they_are_where_scenes_are_moved():

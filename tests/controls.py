@@ -1,0 +1,99 @@
+"""What needs no network where goals are hidden, and so says what a success of a policy is worth.
+
+    python -m tests.controls --suite goals-reach --out runs/controls-reach
+
+`replay` takes the demonstration's actions one by one. `servo` moves the hand to where it was at the
+demonstration's end, with the fingers as they were there. `expert` is Meta-World's script, which is
+told the goal. Episodes and demonstrations are as many as in `evaluate.py --split novel`; the
+demonstration of each episode is drawn anew.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import command_line, locked, provenance, report_progress, run_jobs
+from data import load_demonstrations
+from evaluate import EVALUATION_SEED, claim_results
+from report import Outcomes, write_report
+from simulator import Simulator, collect, evaluation_seed, simulator_of
+
+CONTROLS = ("replay", "servo", "expert")
+STIFFNESS = 5.0  # of the servo: an action of 1 for 20 centimetres, as Meta-World's script for reach
+
+
+def control_job(
+    simulator: Simulator, task: str, recording: Path, seeds: Sequence[int]
+) -> dict[str, list[list[bool]]]:
+    """Control -> for each episode whether each of its steps was a success."""
+    demonstrations = load_demonstrations(recording)
+    env = simulator.make(task, simulator.recipe["num_points"])
+    successes: dict[str, list[list[bool]]] = {control: [] for control in CONTROLS}
+    for seed in seeds:
+        index = np.random.default_rng(seed).integers(len(demonstrations))
+        frames = demonstrations.episode(index)
+        actions = demonstrations.action[frames]  # (T, 4)
+        target = demonstrations.state[frames.stop - 1, :3]  # of the hand
+        for control, of_episodes in successes.items():
+            env.begin(seed)
+            steps = []
+            for step in range(simulator.episode_steps):
+                if control == "replay":
+                    action = actions[min(step, len(actions) - 1)]
+                elif control == "servo":
+                    hand = env.observe()["agent_pos"][:3]
+                    action = np.append(np.clip(STIFFNESS * (target - hand), -1, 1), actions[-1, 3])
+                else:
+                    action = env.expert_action()
+                _, _, info = env.advance(action)
+                steps.append(info["success"])
+            of_episodes.append(steps)
+            report_progress(task, 1)
+    return successes
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description="Measures what needs no network.")
+    parser.add_argument("--suite", default="goals-reach", help="of hidden goals (goals-reach)")
+    parser.add_argument("--data", default="data", help="folder of the demonstrations (data)")
+    parser.add_argument("--episodes", type=int, default=5, help="episodes a task (5)")
+    parser.add_argument("--workers", type=int, help="processes (one a core)")
+    parser.add_argument("--out", default="runs/controls", help="folder of the report")
+    args = parser.parse_args(argv)
+
+    simulator = simulator_of(args.suite)
+    _, tasks = simulator.tasks(args.suite)
+    out = Path(args.out)
+    with locked(out):
+        claim_results(out, overwrite=False)
+        recordings = collect(
+            simulator, tasks, args.data, episodes=simulator.demonstrations, workers=args.workers
+        )
+        seeds = [evaluation_seed(EVALUATION_SEED, i) for i in range(args.episodes)]
+        jobs: list[dict[str, Any]] = [
+            {"simulator": simulator, "task": task, "recording": recording, "seeds": seeds}
+            for task, recording in recordings.items()
+        ]
+        results = run_jobs(
+            control_job,
+            jobs,
+            workers=args.workers,
+            total=len(jobs) * len(seeds) * len(CONTROLS),
+            description="controls",
+        )
+        outcomes = {
+            control: Outcomes(
+                {task: [any(s) for s in of[control]] for task, of in zip(tasks, results)},
+                {task: [s[-1] for s in of[control]] for task, of in zip(tasks, results)},
+            )
+            for control in CONTROLS
+        }
+        facts = provenance("-m tests.controls", argv, "cpu")
+        print(write_report(out, outcomes, {"title": f"{args.suite}, no network", **facts}))
+
+
+if __name__ == "__main__":
+    command_line(main)

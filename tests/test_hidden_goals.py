@@ -1,0 +1,163 @@
+"""Goals that no observation tells: where they lie, what is seen of them, which seeds draw them."""
+
+from itertools import combinations
+
+import mujoco
+import numpy as np
+import pytest
+
+import hidden_goals
+from hidden_goals import SKILLS, HiddenGoalEnv, HiddenGoals, goal_of, names_of, start_of
+from simulator import demonstration_seed, evaluation_seed, record_episode, simulator_of
+
+SIMULATOR = HiddenGoals()
+
+
+def tasks_of(skill):
+    """All tasks of a skill."""
+    base, novel = SIMULATOR.tasks(f"goals-{skill}")
+    _, validation = SIMULATOR.tasks(f"goals-{skill}-validation")
+    return [*base, *validation, *novel]
+
+
+def test_a_suite_has_its_goals_and_its_validation_other_ones():
+    assert simulator_of("goals-push") == SIMULATOR
+    base, novel = SIMULATOR.tasks("goals-pick-place")
+    again, validation = SIMULATOR.tasks("goals-pick-place-validation")
+    assert (len(base), len(validation), len(novel)) == (320, 10, 20) and base == again
+    assert base[7] == "pick-place-goal-07" and novel[19] == "pick-place-novel-19"
+    assert set(base) | set(novel) | set(validation) <= set(SIMULATOR.instructions)
+    assert len({SIMULATOR.instructions[task] for task in base + novel}) == 1
+
+
+@pytest.mark.parametrize("skill", SKILLS)
+def test_goals_lie_on_a_wide_area_and_no_two_are_one(skill):
+    goals = np.stack([goal_of(task) for task in tasks_of(skill)])
+    assert np.array_equal(goals, [goal_of(task) for task in tasks_of(skill)])  # drawn once
+    assert len(np.unique(goals, axis=0)) == 350
+    low, high = np.array([hidden_goals.GOAL_LOW, hidden_goals.GOAL_HIGH])
+    if skill == "push":
+        low[2] = high[2] = hidden_goals.ON_TABLE
+    assert (goals >= low).all() and (goals <= high).all()
+    assert (np.ptp(goals, axis=0) >= 0.8 * (high - low)).all()
+
+
+def test_no_start_is_so_near_a_goal_that_meta_world_would_draw_it_again():
+    corners = np.array([[x, y] for x in (-1, 1) for y in (-1, 1)]) * hidden_goals.OBJECT_SPREAD
+    corners = corners + hidden_goals.OBJECT_MIDDLE
+    starts = [start_of(seed)[0] for seed in range(200)]
+    assert (starts >= corners.min(axis=0)).all() and (starts <= corners.max(axis=0)).all()
+    for skill in SKILLS:
+        for task in tasks_of(skill):
+            assert np.linalg.norm(corners - goal_of(task)[:2], axis=1).min() > 0.15
+
+
+def test_demonstrations_and_rollouts_begin_at_different_places():
+    groups = {
+        "demonstrations": [
+            demonstration_seed(SIMULATOR, task, 0, attempt)
+            for task in SIMULATOR.instructions
+            for attempt in range(5)
+        ],
+        "rollouts": [evaluation_seed(seed, i) for seed in range(50) for i in range(20)],
+    }
+    places = {
+        name: {tuple(np.concatenate(start_of(seed)).tolist()) for seed in seeds}
+        for name, seeds in groups.items()
+    }
+    assert len(places["demonstrations"]) == len(groups["demonstrations"])
+    assert len(places["rollouts"]) == len(groups["rollouts"])
+    assert not places["demonstrations"] & places["rollouts"]
+
+
+@pytest.fixture(scope="module")
+def environments():
+    """Two environments of each skill, whose goals are far from each other."""
+    pairs = {}
+    for skill in SKILLS:
+        tasks = names_of(skill, "validation")
+        first, second = max(
+            combinations(tasks, 2), key=lambda pair: np.linalg.norm(np.diff([*map(goal_of, pair)]))
+        )
+        pairs[skill] = [SIMULATOR.make(task, 64) for task in (first, second)]
+    return pairs
+
+
+@pytest.mark.parametrize("skill", SKILLS)
+def test_two_goals_from_one_start_are_equal_clouds_and_another_start_is_not(environments, skill):
+    first, second = environments[skill]
+    for seed in (3, 10**8):
+        observations, pictures = [], []
+        for env in (first, second):
+            env.begin(seed)
+            target = env.sawyer_env._target_pos
+            np.testing.assert_allclose(target, env.goal, atol=1e-2)  # push: the object's height
+            marker = env.sawyer_env.data.site("goal").xpos
+            np.testing.assert_allclose(marker, target)
+            np.testing.assert_allclose(env.expert_observation[-3:], target)  # not clipped
+            observations.append(env.observe())
+            pictures.append(env.render())
+        for name, x in observations[0].items():
+            assert np.array_equal(x, observations[1][name])
+        assert (pictures[0] != pictures[1]).any()  # which show the markers
+    begun = first.observe()
+    first.begin(4)
+    assert not np.array_equal(begun["point_cloud"], first.observe()["point_cloud"])
+    assert np.abs(begun["agent_pos"] - first.observe()["agent_pos"]).max() > 0.01
+
+
+def test_the_cloud_lacks_the_marker_and_nothing_else(environments):
+    """With the goal beside the hand, where both are seen, the marker's points alone are missing."""
+    env, _ = environments["reach"]
+    env.begin(0)
+    model, data = env.sawyer_env.model, env.sawyer_env.data
+    model.site("goal").pos[:] = data.body("hand").xpos + [0.0, 0.1, 0.0]
+    mujoco.mj_forward(model, data)
+    whole, hits = env.make_camera(hidden_goals.CAMERA_PIXELS).points(data, segmentation=True)
+    of_marker = hits == model.ngeom + model.site("goal").id
+    seen, _ = env.camera.points(data, segmentation=True)
+    assert 0 < of_marker.sum() < len(whole)
+    missing = {*map(tuple, whole.tolist())} - {*map(tuple, seen.tolist())}
+    assert missing == {*map(tuple, whole[of_marker].tolist())}
+
+
+def test_nothing_is_learned_of_goals_from_first_observations(environments):
+    """The best linear map, on goals that it was not fitted to, is no better than their mean."""
+    for skill, (env, _) in environments.items():
+        seen, goals = [], []
+        for i, task in enumerate(tasks_of(skill)[::6]):
+            env.goal = goal_of(task)
+            env.begin(demonstration_seed(SIMULATOR, task, 0, 0) if i % 2 else evaluation_seed(1, i))
+            observation = env.observe()
+            cloud = observation["point_cloud"]
+            seen.append([*cloud.mean(0), *cloud.max(0), *observation["agent_pos"][:3], 1.0])
+            goals.append(env.goal)
+        seen, goals = np.array(seen), np.array(goals)
+        half = len(goals) // 2
+        weights, *_ = np.linalg.lstsq(seen[:half], goals[:half], rcond=1e-6)
+        error = np.square(seen[half:] @ weights - goals[half:])[:, :2].mean()
+        of_mean = np.square(goals[:half].mean(axis=0) - goals[half:])[:, :2].mean()
+        assert error > 0.9 * of_mean, skill
+
+
+@pytest.mark.parametrize("skill", SKILLS)
+def test_experts_reach_goals_and_stay_there(environments, skill):
+    env, _ = environments[skill]
+    arrays, success_frame = record_episode(env, seed=5, at_end=True)
+    assert len(arrays["action"]) == SIMULATOR.episode_steps and 20 < success_frame < 90
+    assert arrays["points"].shape == (100, 64, 3) and arrays["state"].shape == (100, 9)
+
+
+def test_an_episode_that_does_not_end_in_success_is_not_kept(environments, monkeypatch):
+    env, _ = environments["reach"]
+    monkeypatch.setattr(env, "episode_steps", 3)
+    advance = HiddenGoalEnv.advance
+    for outcomes, kept in (((0, 1, 0), False), ((0, 1, 1), True), ((0, 0, 0), False)):
+        steps = iter(outcomes)
+
+        def told(action, steps=steps):
+            reward, truncated, _ = advance(env, action)
+            return reward, truncated, {"success": bool(next(steps))}
+
+        monkeypatch.setattr(env, "advance", told)
+        assert (record_episode(env, seed=5, at_end=True) is not None) == kept
