@@ -9,6 +9,7 @@ demonstration of each episode is drawn anew.
 """
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             )
             for control in CONTROLS
         }
-        facts = provenance("-m tests.controls", argv, "cpu")
+        facts = provenance(
+            "-m", ["tests.controls", *(sys.argv[1:] if argv is None else argv)], "cpu"
+        )
         print(write_report(out, outcomes, {"title": f"{args.suite}, no network", **facts}))
 
 
