@@ -220,7 +220,7 @@ def maml_gradient(
     `batches` are those of `task_batch`, one for each task, `vectorize` of which run at once.
     Returns parameter name -> gradient, and the mean query loss after the inner step, ().
     """
-    gradients, losses = meta_gradient(
+    gradients, _, losses = meta_gradient(
         partial(loss_of, policy),
         dict(policy.named_parameters()),
         [split(batch, settings.support) for batch in batches],
