@@ -11,6 +11,13 @@ the matrix of second derivatives of the support loss at theta, the chain rule sa
 H_i is never made: autograd takes v_i back through the support gradient, and that gives H_i v_i at
 about the price of another gradient. First-order MAML leaves H_i out.
 
+alpha is one number, or one for each tensor of theta, which can then be learned as well (Meta-SGD,
+Li et al. 2017; MAML++, Antoniou et al. 2019). For the tensor k and one step
+
+    d L / d alpha_k = -1/|tasks| * sum_i <v_i, grad_theta L(theta, support_i)>_k
+
+in first-order MAML, too. It comes out of the same backward pass as g.
+
 Nothing here knows what a policy is. A model enters as `params`, a dictionary of tensors, and a
 function `loss_fn(params, batch) -> scalar tensor`; with a `torch.nn.Module` that is
 
@@ -34,21 +41,24 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_map
 
 Params = dict[str, Tensor]
+InnerRate = float | dict[str, Tensor]  # alpha: one number, or parameter name -> tensor
 LossFn = Callable[[Params, Any], Tensor]
 
 
 def adapt(
-    loss_fn: LossFn, params: Params, batch: Any, lr: float, steps: int = 1, first_order=False
+    loss_fn: LossFn, params: Params, batch: Any, lr: InnerRate, steps: int = 1, first_order=False
 ) -> Params:
     """Returns the parameters after `steps` steps of gradient descent on one batch (Eq. 2).
 
-    The result is a differentiable function of `params`; the input is not modified.
+    The result is a differentiable function of `params`, and of `lr` where that is tensors; the
+    input is not modified.
 
     Args:
         loss_fn: `(params, batch) -> ()`, pure.
         params: name -> tensor, theta.
         batch: anything `loss_fn` understands, usually the support set of a task.
-        lr: the inner learning rate alpha.
+        lr: the inner learning rate alpha, the same for all parameters; or name -> tensor, one for
+            each parameter, of shape () or any other that broadcasts to the parameter's.
         steps: gradient steps, all on the same batch.
         first_order: first-order MAML: the inner gradient is treated as a constant. It is cheaper,
             and it gives a different meta-gradient.
@@ -57,7 +67,13 @@ def adapt(
         start = {name: p.detach() for name, p in params.items()} if first_order else params
         gradient = grad(loss_fn)(start, batch)
         # p - lr * gradient: one fused operation, forward and backward, instead of two.
-        params = {name: torch.add(p, gradient[name], alpha=-lr) for name, p in params.items()}
+        if isinstance(lr, dict):
+            params = {
+                name: torch.addcmul(p, lr[name], gradient[name], value=-1)
+                for name, p in params.items()
+            }
+        else:
+            params = {name: torch.add(p, gradient[name], alpha=-lr) for name, p in params.items()}
     return params
 
 
@@ -65,11 +81,11 @@ def meta_gradient(
     loss_fn: LossFn,
     params: Params,
     tasks: Iterable[tuple[Any, Any]],
-    lr: float,
+    lr: InnerRate,
     steps: int = 1,
     first_order: bool = False,
     vectorize: int = 1,
-) -> tuple[Params, Tensor]:
+) -> tuple[Params, Params, Tensor]:
     """The gradient of the mean query loss, through each task's inner loop (Eq. 3; Algorithm 1).
 
     Args:
@@ -81,6 +97,8 @@ def meta_gradient(
 
     Returns:
         gradients: name -> tensor.
+        rate_gradients: the gradient for each tensor of `lr`, name -> tensor of the rate's shape;
+            empty where `lr` is a number.
         losses: the query losses with the adapted parameters, (tasks,).
 
     Raises:
@@ -91,33 +109,45 @@ def meta_gradient(
     if vectorize < 1:
         raise ValueError(f"vectorize is {vectorize}: at least one task runs at a time")
     params = {name: p.detach().requires_grad_() for name, p in params.items()}
+    rates = {}
+    if isinstance(lr, dict):
+        lr = rates = {name: rate.detach().requires_grad_() for name, rate in lr.items()}
 
     tasks = iter(tasks)
     losses = []
     total = {name: torch.zeros_like(p) for name, p in params.items()}  # of all tasks' gradients
+    rate_total = {name: torch.zeros_like(rate) for name, rate in rates.items()}
     while chunk := list(islice(tasks, vectorize)):
-        gradients, chunk_losses = chunk_gradient(loss_fn, params, chunk, lr, steps, first_order)
+        gradients, rate_gradients, chunk_losses = chunk_gradient(
+            loss_fn, params, chunk, lr, steps, first_order
+        )
         losses.append(chunk_losses)
         for name, gradient in gradients.items():
             total[name] += gradient
+        for name, gradient in rate_gradients.items():
+            rate_total[name] += gradient
     if not losses:
         raise ValueError("meta_gradient needs at least one task")
     losses = torch.cat(losses)
-    return {name: g / len(losses) for name, g in total.items()}, losses
+    gradients = {name: g / len(losses) for name, g in total.items()}
+    rate_gradients = {name: g / len(losses) for name, g in rate_total.items()}
+    return gradients, rate_gradients, losses
 
 
 def chunk_gradient(
     loss_fn: LossFn,
     params: Params,
     chunk: list[tuple[Any, Any]],
-    lr: float,
+    lr: InnerRate,
     steps: int,
     first_order: bool,
-) -> tuple[Params, Tensor]:
+) -> tuple[Params, Params, Tensor]:
     """The sum over some tasks of their meta-gradients, and their query losses (tasks,).
 
-    `params` require grad. Several tasks run at once, and have adapted parameters each.
+    In between stand the gradients for `lr`, none where it is a number. `params` require grad, and
+    so does `lr` where it is tensors. Several tasks run at once, and have adapted parameters each.
     """
+    rates = lr if isinstance(lr, dict) else {}
 
     def adapt_to(support: Any, params: Params) -> Params:
         return adapt(loss_fn, params, support, lr, steps, first_order)
@@ -138,10 +168,12 @@ def chunk_gradient(
         # sum_i (I - alpha H_i) v_i: the query gradients, taken back through the inner loops
         g = torch.autograd.grad(
             outputs=list(adapted.values()),
-            inputs=list(params.values()),
+            inputs=[*params.values(), *rates.values()],
             grad_outputs=[v[name] for name in adapted],
         )
-    return dict(zip(params, g)), losses.detach().view(-1)
+    gradients = dict(zip(params, g[: len(params)]))
+    rate_gradients = dict(zip(rates, g[len(params) :]))
+    return gradients, rate_gradients, losses.detach().view(-1)
 
 
 # ---- Where PyTorch is wrong under vmap: skip this when reading the method ------------------------

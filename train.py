@@ -61,7 +61,7 @@ from data import (
     suspicions,
     write_text,
 )
-from maml import adapt, meta_gradient
+from maml import InnerRate, adapt, meta_gradient
 from model import TASK_INPUTS, CheckpointError, DAMIPolicy, PolicyConfig, ema_model, split
 from report import Outcomes
 from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
@@ -85,6 +85,12 @@ class Settings:
     support: int = setting(20, "windows a task for the inner step", least=1)
     query: int = setting(88, "windows a task for the outer loss", least=1)
     inner_lr: float = setting(1e-4, "learning rate of the inner step", least=0)
+    learn_inner_lr: bool = setting(
+        False, "learn a rate of the inner step for each tensor of weights, from --inner-lr on"
+    )
+    rate_lr: float = setting(
+        1e-2, "peak learning rate of AdamW for the logarithms of these rates", least=0
+    )
     lr: float = setting(1e-4, "peak learning rate of AdamW", least=0)
     warmup: int = setting(500, "steps of linear warm-up", least=0)
     pretrain_fraction: float = setting(
@@ -121,6 +127,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         common.check_settings(self)
+        if self.learn_inner_lr and self.inner_lr == 0:
+            raise UserError("--inner-lr is 0: --learn-inner-lr starts from a rate above 0")
 
     @property
     def pretrain_steps(self) -> int:
@@ -240,23 +248,38 @@ def multi_task_gradient(
     return dict(zip(parameters, gradients)), loss.detach()
 
 
+def inner_rate(log_rates: dict[str, Tensor], settings: Settings) -> InnerRate:
+    """The inner learning rate as maml.py takes it: those that are learned, or the setting."""
+    if not log_rates:
+        return settings.inner_lr
+    return {name: log_rate.exp() for name, log_rate in log_rates.items()}
+
+
 def maml_gradient(
-    policy: DAMIPolicy, batches: list[dict[str, Tensor]], settings: Settings, vectorize: int
-) -> tuple[dict[str, Tensor], Tensor]:
+    policy: DAMIPolicy,
+    batches: list[dict[str, Tensor]],
+    log_rates: dict[str, Tensor],
+    settings: Settings,
+    vectorize: int,
+) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
     """The gradient of the query loss through each task's inner step (lines 4 to 19).
 
     `batches` are those of `task_batch`, one for each task, `vectorize` of which run at once.
-    Returns parameter name -> gradient, and the mean query loss after the inner step, ().
+    `log_rates` are those of the `TrainingState`. Returns parameter name -> gradient, the same for
+    `log_rates`, and the mean query loss after the inner step, ().
     """
-    gradients, losses = meta_gradient(
+    inner_lr = inner_rate(log_rates, settings)
+    gradients, rate_gradients, losses = meta_gradient(
         partial(loss_of, policy),
         dict(policy.named_parameters()),
         [split(batch, settings.support) for batch in batches],
-        lr=settings.inner_lr,
+        lr=inner_lr,
         first_order=settings.maml == "first",
         vectorize=vectorize,
     )
-    return gradients, losses.mean()
+    # d L / d log(alpha) = alpha * d L / d alpha
+    log_rate_gradients = {name: inner_lr[name] * g for name, g in rate_gradients.items()}
+    return gradients, log_rate_gradients, losses.mean()
 
 
 def tasks_of_step(step: int, tasks: int, settings: Settings) -> list[int]:
@@ -267,12 +290,12 @@ def tasks_of_step(step: int, tasks: int, settings: Settings) -> list[int]:
     return sorted(rng.choice(tasks, settings.tasks_per_step, replace=False).tolist())
 
 
-def learning_rate(step: int, settings: Settings) -> float:
-    """Linear warm-up, then half a cosine, to zero one step after the last."""
+def learning_rate(step: int, settings: Settings, peak: float) -> float:
+    """Linear warm-up to the peak, then half a cosine, to zero one step after the last."""
     if step < settings.warmup:
-        return settings.lr * (step + 1) / settings.warmup
+        return peak * (step + 1) / settings.warmup
     done, steps = step - settings.warmup, max(1, settings.steps - settings.warmup)
-    return settings.lr * 0.5 * (1 + math.cos(math.pi * done / steps))
+    return peak * 0.5 * (1 + math.cos(math.pi * done / steps))
 
 
 @dataclass
@@ -282,8 +305,15 @@ class TrainingState:
     policy: DAMIPolicy
     average: AveragedModel  # of the policy; its `.module` is what is kept and rolled out
     optimizer: torch.optim.Optimizer
+    # Parameter name -> the logarithm () of its inner learning rate, which keeps the rate positive;
+    # empty where the rate is fixed. These are not averaged.
+    log_rates: dict[str, Tensor]
     step: int = 0  # outer steps that are done
     seconds: float = 0.0  # that they took
+
+    def inner_rates(self) -> dict[str, float]:
+        """The learned rates of the inner step, as checkpoints keep them; empty if it is fixed."""
+        return {name: log_rate.exp().item() for name, log_rate in self.log_rates.items()}
 
 
 def start_training(
@@ -299,7 +329,12 @@ def start_training(
     optimizer = torch.optim.AdamW(
         policy.parameters(), lr=settings.lr, betas=(0.95, 0.999), weight_decay=1e-6, fused=True
     )
-    return TrainingState(policy, ema_model(policy), optimizer)
+    log_rates = {}
+    if settings.learn_inner_lr:
+        start = math.log(settings.inner_lr)
+        log_rates = {name: p.new_tensor(start) for name, p in policy.named_parameters()}
+        optimizer.add_param_group({"params": list(log_rates.values()), "weight_decay": 0.0})
+    return TrainingState(policy, ema_model(policy), optimizer, log_rates)
 
 
 LOSS_BEFORE_EVERY = 10  # steps; it serves the log alone
@@ -337,7 +372,9 @@ def meta_train(
     lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
     vectorize = settings.vectorize if len(lengths) == 1 else 1
     without_inner_step = partial(multi_task_gradient, policy, bfloat16=settings.bfloat16)
-    through_inner_step = partial(maml_gradient, policy, settings=settings, vectorize=vectorize)
+    through_inner_step = partial(
+        maml_gradient, policy, log_rates=state.log_rates, settings=settings, vectorize=vectorize
+    )
     if next(policy.parameters()).is_cuda and len(lengths) == 1 and world == 1:
         without_inner_step = CUDAGraphed(without_inner_step)
         through_inner_step = CUDAGraphed(through_inner_step)
@@ -361,8 +398,9 @@ def meta_train(
             batches.append(batch)
 
         # The gradient of the mean loss over my tasks
+        log_rate_gradients = {}
         if inner:
-            gradients, loss = through_inner_step(batches)  # lines 4 to 19
+            gradients, log_rate_gradients, loss = through_inner_step(batches)  # lines 4 to 19
             figures = {"loss": loss}
             if step % LOSS_BEFORE_EVERY == 0:
                 queries = [split(batch, settings.support)[1] for batch in batches]
@@ -374,7 +412,7 @@ def meta_train(
 
         # The mean over all tasks: that of the processes' means, weighted by their numbers of tasks
         if world > 1:
-            for x in (*figures.values(), *gradients.values()):
+            for x in (*figures.values(), *gradients.values(), *log_rate_gradients.values()):
                 dist.all_reduce(x.mul_(len(my_places) / len(places)))
 
         figures["gradient_norm"] = torch.nn.utils.get_total_norm(gradients.values())
@@ -387,7 +425,13 @@ def meta_train(
         # One step of AdamW, and one of the moving average, which is what is kept and rolled out
         for name, parameter in policy.named_parameters():
             parameter.grad = gradients[name]
-        state.optimizer.param_groups[0]["lr"] = lr = learning_rate(step, settings)
+        for name, log_rate in state.log_rates.items():
+            log_rate.grad = log_rate_gradients.get(name)  # None without inner step: AdamW skips it
+        lr = learning_rate(step, settings, peak=settings.lr)
+        state.optimizer.param_groups[0]["lr"] = lr
+        if settings.learn_inner_lr:
+            rate_lr = learning_rate(step, settings, peak=settings.rate_lr)
+            state.optimizer.param_groups[1]["lr"] = rate_lr
         state.optimizer.step()  # line 20
         state.average.update_parameters(policy)  # line 21
         state.step = step + 1
@@ -403,7 +447,8 @@ SAVE_SHARE = 0.04
 
 # These may differ when a run is resumed. Only `vectorize` changes results, in their last bits.
 FREE_TO_CHANGE = ("vectorize", "checkpoint_every", "evaluate_every", "episodes")
-OF_INNER_STEP = ("maml", "inner_lr", "task_dropout")  # may differ as long as there was none
+# These may differ as long as there was no inner step.
+OF_INNER_STEP = ("maml", "inner_lr", "learn_inner_lr", "rate_lr", "task_dropout")
 
 
 def is_milestone(step: int, settings: Settings) -> bool:
@@ -419,6 +464,7 @@ def save_average(folder: Path, state: TrainingState, info: dict[str, Any]) -> No
         state.average.module,
         step=state.step,
         seconds=state.seconds,
+        inner_rates=state.inner_rates(),
         **info,
     )
 
@@ -442,6 +488,7 @@ class Saver:
             "policy": state.policy.state_dict(),
             "optimizer": state.optimizer.state_dict(),
             "n_averaged": state.average.n_averaged,
+            "log_rates": state.log_rates,
         }
         model.save(
             self.path,
@@ -449,6 +496,7 @@ class Saver:
             training=training,
             step=state.step,
             seconds=state.seconds,
+            inner_rates=state.inner_rates(),
             **self.info,
         )
         self.ended = time.monotonic()
@@ -490,7 +538,13 @@ def restore(
     policy.load_state_dict(info["training"]["policy"])
     state.average.module.load_state_dict(averaged.state_dict())
     state.average.n_averaged.copy_(info["training"]["n_averaged"])
-    state.optimizer.load_state_dict(info["training"]["optimizer"])
+    # Before the first inner step the inner rates, and AdamW's second group, are as they begin.
+    optimizer_state = info["training"]["optimizer"]
+    optimizer_state["param_groups"][1:] = state.optimizer.state_dict()["param_groups"][1:]
+    state.optimizer.load_state_dict(optimizer_state)
+    if info["step"] > settings.pretrain_steps:
+        for name, log_rate in state.log_rates.items():
+            log_rate.copy_(info["training"]["log_rates"][name])
     state.step, state.seconds = info["step"], info["seconds"]
     return info
 
@@ -597,7 +651,15 @@ def log_heldout_errors(
         f"step {state.step}": mean_of_tasks(measured),
     }
     if state.step == settings.steps:
-        rows.update(heldout_controls(policy, train_samplers, heldout_samplers, text, settings))
+        controls = heldout_controls(
+            policy,
+            train_samplers,
+            heldout_samplers,
+            text,
+            settings,
+            inner_lr=inner_rate(state.log_rates, settings),
+        )
+        rows.update(controls)
     names = next(iter(train_samplers.values())).action_names
     tables = [report.heldout_table(columns), report.action_error_table(rows, names)]
     write_text(folder / "held-out.md", "\n\n".join([*tables, f"{report.HELDOUT_NOTE}\n"]))
@@ -614,6 +676,7 @@ def heldout_controls(
     heldout_samplers: dict[str, WindowSampler],
     text: dict[str, Tensor],
     settings: Settings,
+    inner_lr: InnerRate,
 ) -> dict[str, np.ndarray]:
     """Whether a policy reads its demonstration, and what an inner step does, where nothing can be
     rolled out: title -> errors (A,) on held-out episodes, as means over tasks.
@@ -641,8 +704,7 @@ def heldout_controls(
             )
             adapted = copy.deepcopy(policy)
             adapted.load_state_dict(
-                adapt(partial(loss_of, policy), params, support, settings.inner_lr, steps),
-                strict=False,
+                adapt(partial(loss_of, policy), params, support, inner_lr, steps), strict=False
             )
             measured[task] = evaluate.action_error(
                 adapted, train_samplers[task], heldout_sampler, text[task]
@@ -820,7 +882,7 @@ def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int,
     if world == 1:
         return device, 0, 1
     if world > tasks:
-        raise UserError(f"{world} processes for {tasks} tasks: use at most one a task")
+        raise UserError(f"{world} processes for {tasks} tasks a step: use at most one a task")
     if "RANK" not in os.environ:
         raise UserError("WORLD_SIZE is set and RANK is not: start with torchrun, or unset it")
     if device.type == "cuda" and device.index is None:
@@ -1031,7 +1093,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     trained_on = suite if simulator else f"own-{Path(args.data).resolve().name}"
     folder = Path(args.out or f"runs/{trained_on}-{name}-seed{settings.seed}")
 
-    device, rank, world = join_processes(device, tasks=len(paths))
+    tasks_per_step = min(len(paths), settings.tasks_per_step or len(paths))
+    device, rank, world = join_processes(device, tasks=tasks_per_step)
     with common.locked(folder) if rank == 0 else nullcontext():
         if rank == 0:
             where = f"{device} ({common.hardware(device)})"

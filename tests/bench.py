@@ -364,8 +364,8 @@ class InnerStepBench:
                 weights.append(relative_change(adapted, self.params))
                 for batch, changes in ((support, support_losses), (query, query_losses)):
                     changes.append(self.loss(adapted, batch) / self.loss(self.params, batch) - 1)
-            plain, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=0.0)
-            gradient, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=inner_lr)
+            plain, _, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=0.0)
+            gradient, _, _ = meta_gradient(self.loss_fn, self.params, pairs, lr=inner_lr)
             gradients.append(relative_change(gradient, plain))
         return (
             float(np.median(weights)),
@@ -484,7 +484,7 @@ def print_peers(folder: Path, recording: Demonstrations, device: torch.device, r
     settings, policy = bench.settings, bench.policy
     batches = bench.batches(10)
     pairs = [split(batch, settings.support) for batch in batches]
-    ours, _ = meta_gradient(
+    ours, _, _ = meta_gradient(
         partial(loss_of, policy),
         dict(policy.named_parameters()),
         pairs,

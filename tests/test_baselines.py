@@ -306,7 +306,7 @@ def test_the_meta_gradient_equals_finite_differences_one_by_one_and_vectorized(n
     loss = lambda params, batch: functional_call(policy, params, (), batch)  # noqa: E731
 
     def flat(**options):
-        gradients, after = meta_gradient(loss, params, tasks, lr, **options)
+        gradients, _, after = meta_gradient(loss, params, tasks, lr, **options)
         return torch.cat([g.flatten() for g in gradients.values()]), after
 
     (second, losses), (first, _) = flat(), flat(first_order=True)

@@ -61,14 +61,21 @@ def unflat(vector, like):
 
 
 def objective(setting, vector, lr, steps):
-    """The mean query loss after adaptation, by plain autograd, without torch.func."""
+    """The mean query loss after adaptation, by plain autograd, without torch.func.
+
+    `lr` is a number, or a rate for each parameter, as in `adapt`.
+    """
+    rates = lr if isinstance(lr, dict) else dict.fromkeys(setting.params, lr)
     total = 0.0
     for support, query in setting.tasks:
         params = unflat(vector, setting.params)
         for _ in range(steps):
             leaves = {name: p.detach().requires_grad_() for name, p in params.items()}
             gradients = torch.autograd.grad(setting.loss(leaves, support), list(leaves.values()))
-            params = {name: p.detach() - lr * g for (name, p), g in zip(leaves.items(), gradients)}
+            params = {
+                name: p.detach() - rates[name] * g
+                for (name, p), g in zip(leaves.items(), gradients)
+            }
         with torch.no_grad():
             total += setting.loss(params, query).item() / len(setting.tasks)
     return total
@@ -122,7 +129,7 @@ def test_the_meta_gradient_of_quadratics_has_its_closed_form(steps, vectorize):
         second += jacobian.T @ (c @ adapted - d) / 3
         losses.append(0.5 * adapted @ c @ adapted - d @ adapted)
     for expected, first_order in ((second, False), (first, True)):
-        gradient, values = meta_gradient(
+        gradient, _, values = meta_gradient(
             loss, {"x": theta}, tasks, lr, steps, first_order, vectorize
         )
         torch.testing.assert_close(gradient["x"], expected)
@@ -139,7 +146,7 @@ def test_one_task_after_another_equals_all_tasks_under_vmap(setting, steps, firs
         )
         for vectorize in (1, 2)
     ]
-    (loop, losses), (vectorized, values) = runs
+    (loop, _, losses), (vectorized, _, values) = runs
     torch.testing.assert_close(losses, values)
     assert losses.shape == (3,) and losses.std() > 1e-3
     assert list(loop) == list(vectorized) == list(setting.params)
@@ -148,7 +155,7 @@ def test_one_task_after_another_equals_all_tasks_under_vmap(setting, steps, firs
 
 
 def test_first_order_is_the_query_gradient_at_the_adapted_parameters(setting):
-    gradient, _ = meta_gradient(
+    gradient, _, _ = meta_gradient(
         setting.loss, setting.params, setting.tasks[:1], 0.1, 2, first_order=True
     )
     support, query = setting.tasks[0]
@@ -179,10 +186,72 @@ def test_parameters_may_have_one_gradient_between_them(vectorize):
     params = {name: torch.full((3,), value) for name, value in (("a", 0.3), ("b", -0.5))}
     tasks = [(torch.full((3,), float(i)), torch.arange(3.0) + i) for i in range(3)]
     loss = lambda p, x: ((p["a"] + p["b"] - x) ** 2).sum()  # noqa: E731
-    one, _ = meta_gradient(loss, params, tasks, 0.1, first_order=True, vectorize=vectorize)
+    one, _, _ = meta_gradient(loss, params, tasks, 0.1, first_order=True, vectorize=vectorize)
     adapted = [-0.2 + 2 * 0.1 * 2 * (support + 0.2) for support, _ in tasks]
     expected = torch.stack([2 * (x - query) for x, (_, query) in zip(adapted, tasks)]).mean(dim=0)
     torch.testing.assert_close(one, {"a": expected, "b": expected})
+
+
+# ---- The gradient for the rates of the inner step ------------------------------------------------
+
+
+def sample_rates(params, scale):
+    """A rate for each parameter, none like another; for a matrix one for each of its rows."""
+    generator = torch.Generator().manual_seed(5)
+    shapes = {name: (len(p), 1) if p.dim() == 2 else () for name, p in params.items()}
+    return {
+        name: scale * (0.5 + torch.rand(shape, generator=generator, dtype=torch.float64))
+        for name, shape in shapes.items()
+    }
+
+
+@pytest.mark.parametrize("vectorize", [1, 2])
+@pytest.mark.parametrize(
+    "steps, scale, first_order", [(1, 0.3, False), (3, 0.1, False), (1, 0.3, True)]
+)
+def test_the_gradients_for_the_rates_equal_finite_differences(
+    setting, steps, scale, first_order, vectorize
+):
+    rates = sample_rates(setting.params, scale)
+    gradients, rate_gradients, _ = meta_gradient(
+        setting.loss, setting.params, setting.tasks, rates, steps, first_order, vectorize
+    )
+    assert {name: g.shape for name, g in rate_gradients.items()} == {
+        name: rate.shape for name, rate in rates.items()
+    }
+    start, h = flat(setting.params), 1e-6
+    gradient, rate_gradient = flat(gradients), flat(rate_gradients)
+    torch.manual_seed(1)
+    for direction in (rate_gradient, torch.randn_like(rate_gradient)):
+        direction = direction / direction.norm()
+        ahead, behind = (
+            objective(setting, start, unflat(flat(rates) + sign * h * direction, rates), steps)
+            for sign in (1, -1)
+        )
+        slope = (ahead - behind) / (2 * h)
+        assert float(rate_gradient @ direction) == pytest.approx(slope, rel=1e-5, abs=1e-8)
+    if not first_order:  # the weights' gradient runs through all these rates
+        direction = torch.randn_like(start)
+        direction = direction / direction.norm()
+        ahead, behind = (
+            objective(setting, start + sign * h * direction, rates, steps) for sign in (1, -1)
+        )
+        slope = (ahead - behind) / (2 * h)
+        assert float(gradient @ direction) == pytest.approx(slope, rel=1e-5, abs=1e-8)
+
+
+@pytest.mark.parametrize("first_order", [False, True])
+@pytest.mark.parametrize("vectorize", [1, 2])
+def test_equal_rates_are_one_rate(setting, vectorize, first_order):
+    rates = dict.fromkeys(setting.params, torch.tensor(0.1, dtype=torch.float64))
+    (one, of_one, losses), (many, of_many, again) = (
+        meta_gradient(setting.loss, setting.params, setting.tasks, lr, 2, first_order, vectorize)
+        for lr in (0.1, rates)
+    )
+    torch.testing.assert_close(losses, again)
+    torch.testing.assert_close(many, one, atol=1e-12, rtol=1e-10)
+    assert of_one == {} and of_many.keys() == setting.params.keys()
+    assert all(rate.requires_grad is False and rate.grad is None for rate in rates.values())
 
 
 # ---- Every layer of torch.nn, with and without vmap ----------------------------------------------
@@ -367,7 +436,9 @@ def test_memory_does_not_grow_with_the_number_of_tasks(setting, vectorize):
                     alive.append(storages.alive())  # what is left of the tasks so far
                 yield setting.batch(2 * i, 4), setting.batch(2 * i + 1, 6)
 
-        _, losses = meta_gradient(setting.loss, setting.params, tasks(), 0.1, vectorize=vectorize)
+        _, _, losses = meta_gradient(
+            setting.loss, setting.params, tasks(), 0.1, vectorize=vectorize
+        )
     assert len(losses) == 5 * vectorize and max(size for _, size in storages.made) > 1000
     parameters = sum(p.numel() for p in setting.params.values()) * 8
     assert (
@@ -378,7 +449,7 @@ def test_memory_does_not_grow_with_the_number_of_tasks(setting, vectorize):
 
 def test_the_result_carries_no_graph_although_the_parameters_require_grad(setting):
     for vectorize in (1, 2):
-        gradients, losses = meta_gradient(
+        gradients, _, losses = meta_gradient(
             setting.loss, setting.params, setting.tasks, 0.1, vectorize=vectorize
         )
         assert all(p.requires_grad for p in setting.params.values())

@@ -877,7 +877,7 @@ for step in range(3):
         tasks.append(model.split(batch | {"text": torch.zeros(1, config.text_dim)}, 4))
     loss = lambda params, batch: functional_call(policy, params, (), batch)
     before = torch.stack([loss(params, query) for _, query in tasks])
-    gradients, after = maml.meta_gradient(loss, params, tasks, lr=0.01)
+    gradients, _, after = maml.meta_gradient(loss, params, tasks, lr=0.01)
     for name, parameter in params.items():
         parameter.grad = gradients[name]
     optimizer.step()

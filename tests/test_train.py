@@ -105,12 +105,12 @@ def test_help_says_each_presets_value(capsys):
 
 def test_the_learning_rate_warms_up_and_falls_to_zero_along_a_cosine():
     settings = train.Settings(steps=1500, lr=1e-3, warmup=500)
-    rate = functools.partial(train.learning_rate, settings=settings)
+    rate = functools.partial(train.learning_rate, settings=settings, peak=settings.lr)
     assert rate(0) == pytest.approx(1e-3 / 500)
     assert rate(499) == rate(500) == pytest.approx(1e-3)
     assert rate(1000) == pytest.approx(5e-4)
     assert 0 < rate(1499) < 1e-8 and rate(1500) == pytest.approx(0, abs=1e-12)
-    assert train.learning_rate(0, replace(settings, warmup=0)) == 1e-3
+    assert train.learning_rate(0, replace(settings, warmup=0), peak=1e-3) == 1e-3
     assert np.all(np.diff([rate(step) for step in range(500, 1500)]) < 0)
 
 
@@ -219,17 +219,32 @@ def two_tasks():
     return samplers, text
 
 
+def adam_direction(moments, name, gradient, step):
+    """Where Adam goes at a learning rate of 1, with betas 0.95 and 0.999; updates its moments."""
+    m, v = moments[name]
+    moments[name] = m, v = 0.95 * m + 0.05 * gradient, 0.999 * v + 0.001 * gradient**2
+    unbiased_m, unbiased_v = m / (1 - 0.95 ** (step + 1)), v / (1 - 0.999 ** (step + 1))
+    return unbiased_m / (unbiased_v.sqrt() + 1e-8)
+
+
 def plain_meta_training(policy, samplers, text, settings):
     """Algorithm 1 with SGD's inner step, AdamW and the moving average written out.
 
-    Yields after each outer step (weights, averaged weights, query loss, query loss before the inner
-    step, gradient norm). Draws are as train.py says: they follow from (seed, step, task) alone.
+    Yields after each outer step (weights, averaged weights, logarithms of the inner rates, query
+    loss, query loss before the inner step, gradient norm). Draws are as train.py says: they follow
+    from (seed, step, task) alone.
     """
     theta = {name: p.detach().clone() for name, p in policy.named_parameters()}
-    m, v, average = ({name: torch.zeros_like(p) for name, p in theta.items()} for _ in range(3))
+    average = {name: torch.zeros_like(p) for name, p in theta.items()}
+    log_rates = {
+        name: torch.tensor(math.log(settings.inner_lr), dtype=torch.float64) for name in theta
+    }
+    moments = {name: (0.0, 0.0) for name in theta}
+    rate_moments = {name: (0.0, 0.0) for name in theta}
     n = settings.support + settings.query
     for step in range(settings.steps):
         theta = {name: p.requires_grad_() for name, p in theta.items()}
+        log_rates = {name: x.requires_grad_() for name, x in log_rates.items()}
         after, before = [], []
         for i, (task, sampler) in enumerate(samplers.items()):
             seed = np.random.SeedSequence((settings.seed, step, i)).generate_state(2, np.uint64)[0]
@@ -242,41 +257,57 @@ def plain_meta_training(policy, samplers, text, settings):
             loss = functional_call(policy, theta, (), support)
             gradient = torch.autograd.grad(loss, list(theta.values()), create_graph=True)
             adapted = {
-                name: p - settings.inner_lr * g for (name, p), g in zip(theta.items(), gradient)
+                name: p - log_rates[name].exp() * g for (name, p), g in zip(theta.items(), gradient)
             }
             after.append(functional_call(policy, adapted, (), query))
             before.append(functional_call(policy, theta, (), query))
         loss = torch.stack(after).mean()
-        gradients = dict(zip(theta, torch.autograd.grad(loss, list(theta.values()))))
+        gradients = torch.autograd.grad(loss, [*theta.values(), *log_rates.values()])
+        rate_gradients = dict(zip(log_rates, gradients[len(theta) :]))
+        gradients = dict(zip(theta, gradients))
 
         warm = (step + 1) / settings.warmup
         done = (step - settings.warmup) / (settings.steps - settings.warmup)
-        rate = settings.lr * (warm if warm <= 1 else (1 + math.cos(math.pi * done)) / 2)
+        scale = warm if warm <= 1 else (1 + math.cos(math.pi * done)) / 2
         decay = 0 if step == 0 else 1 - (1 + step) ** -0.75
         theta = {name: p.detach() for name, p in theta.items()}
-        for name, g in gradients.items():  # AdamW, betas 0.95 and 0.999, weight decay 1e-6
-            m[name] = 0.95 * m[name] + 0.05 * g
-            v[name] = 0.999 * v[name] + 0.001 * g**2
-            unbiased_m = m[name] / (1 - 0.95 ** (step + 1))
-            unbiased_v = v[name] / (1 - 0.999 ** (step + 1))
-            shrunk = theta[name] * (1 - rate * 1e-6)
-            theta[name] = shrunk - rate * unbiased_m / (unbiased_v.sqrt() + 1e-8)
+        log_rates = {name: x.detach() for name, x in log_rates.items()}
+        for name, g in gradients.items():  # AdamW, weight decay 1e-6
+            direction = adam_direction(moments, name, g, step)
+            shrunk = theta[name] * (1 - scale * settings.lr * 1e-6)
+            theta[name] = shrunk - scale * settings.lr * direction
             average[name] = decay * average[name] + (1 - decay) * theta[name]
+        if settings.learn_inner_lr:
+            for name, g in rate_gradients.items():  # no weight decay
+                direction = adam_direction(rate_moments, name, g, step)
+                log_rates[name] = log_rates[name] - scale * settings.rate_lr * direction
         norm = torch.cat([g.flatten() for g in gradients.values()]).norm()
-        yield theta, average, loss.item(), torch.stack(before).mean().item(), norm.item()
+        yield theta, average, log_rates, loss.item(), torch.stack(before).mean().item(), norm.item()
 
 
+@pytest.mark.parametrize("learned", [False, True])
 def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_written_out(
-    monkeypatch,
+    monkeypatch, learned
 ):
     monkeypatch.setattr(train, "LOSS_BEFORE_EVERY", 2)
     samplers, text = two_tasks()
     settings = train.Settings(
-        seed=3, steps=4, support=2, query=3, inner_lr=0.05, lr=1e-2, warmup=2, vectorize=2
+        seed=3,
+        steps=4,
+        support=2,
+        query=3,
+        inner_lr=0.05,
+        learn_inner_lr=learned,
+        rate_lr=0.5,
+        lr=1e-2,
+        warmup=2,
+        vectorize=2,
     )
     state = train.start_training(model.PRESETS["tiny"], settings, samplers, "cpu")
     policy = state.policy.double()  # in place: the optimizer's parameters, too
     average = state.average.module.double()
+    for log_rate in state.log_rates.values():
+        log_rate.data = torch.tensor(math.log(settings.inner_lr), dtype=torch.float64)
     for part in ("points", "state", "action"):  # scaled to both tasks
         whole = torch.cat([getattr(sampler, part).flatten(0, -2) for sampler in samplers.values()])
         scaled = policy.normalizer.normalize(part, whole)
@@ -284,7 +315,8 @@ def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_writ
             assert torch.allclose(end, torch.full_like(end, -1))
     plain = plain_meta_training(copy.deepcopy(policy), samplers, text, settings)
     training = train.meta_train(state, samplers, text, settings)
-    for k, (theta, averaged, loss, before, norm), figures in zip(range(4), plain, training):
+    for k, expected, figures in zip(range(4), plain, training):
+        theta, averaged, log_rates, loss, before, norm = expected
         assert state.step == k + 1 and figures["loss"] == pytest.approx(loss, rel=1e-9)
         assert ("loss_before" in figures) == (k % 2 == 0)  # it is not measured at every step
         if k % 2 == 0:
@@ -294,6 +326,9 @@ def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_writ
             assert torch.allclose(parameter, theta[name], atol=1e-9), (k, name)
         for name, parameter in average.named_parameters():
             assert torch.allclose(parameter, averaged[name], atol=1e-9), (k, name)
+        assert state.log_rates.keys() == (log_rates.keys() if learned else set())
+        for name, log_rate in state.log_rates.items():
+            assert torch.allclose(log_rate, log_rates[name], atol=1e-9), (k, name)
     assert k == 3 and list(training) == []
 
 
@@ -568,7 +603,7 @@ def test_a_policy_that_reads_no_demonstration_keeps_its_instruction():
 def test_two_processes_under_torchrun_train_as_one_does(pair, tmp_path):
     folder = shutil.copytree(pair, tmp_path / "three")  # tasks: unequal shares
     save_recording(folder, own_recording(180, ends=[90, 180], task="wipe"))
-    argv = [*SHORT, "--steps", "3", "--data", str(folder)]
+    argv = [*SHORT, "--steps", "3", "--learn-inner-lr", "--data", str(folder)]
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     launcher += ["--nproc-per-node", "2", str(ROOT / "train.py")]
     two = subprocess.run(
@@ -586,12 +621,86 @@ def test_two_processes_under_torchrun_train_as_one_does(pair, tmp_path):
     def all_weights(policy):
         return torch.cat([policy[n].flatten() for n in one if "normalizer" not in n])
 
-    one, two = (whole_state(tmp_path / name)["training"]["policy"] for name in ("one", "two"))
+    trainings = [whole_state(tmp_path / name)["training"] for name in ("one", "two")]
+    rates, rates_of_two = (torch.stack([*t["log_rates"].values()]) for t in trainings)
+    assert (rates - rates_of_two).norm() < 1e-2 * (rates - math.log(1e-3)).norm()
+    one, two = (training["policy"] for training in trainings)
     torch.manual_seed(0)
     start = model.build_policy(model.load(tmp_path / "one" / "last.pt")[0].config)
     moved = all_weights(one) - all_weights(start.state_dict())
     assert (all_weights(one) - all_weights(two)).norm() < 1e-3 * moved.norm()
     assert moved.norm() > 0.1
+
+
+# ---- Learned rates of the inner step -------------------------------------------------------------
+
+
+def stop_after(step, monkeypatch, argv):
+    """Trains until Ctrl-C comes after a step."""
+    append_json = train.append_json
+
+    def append_and_interrupt(path, **values):
+        append_json(path, **values)
+        if values["step"] == step:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(train, "append_json", append_and_interrupt)
+        train.main(argv)
+
+
+def test_learned_rates_are_resumed_to_the_same_bits_and_stand_in_every_checkpoint(
+    pair, finished, tmp_path, monkeypatch
+):
+    argv = [*SHORT, "--data", str(pair), "--learn-inner-lr"]
+    train.main([*argv, "--out", "whole"])
+    stop_after(3, monkeypatch, [*argv, "--out", "resumed"])
+    train.main([*argv, "--out", "resumed", "--resume"])
+    assert same_bits(whole_state(Path("resumed")), whole_state(Path("whole")))
+    state = whole_state(Path("whole"))
+    kept = {
+        path.name: weights(path)[1]["inner_rates"] for path in sorted(Path("whole").glob("*.pt"))
+    }
+    names = {name for name, _ in model.load("whole/last.pt")[0].named_parameters()}
+    assert all(rates.keys() == names for rates in kept.values())
+    assert kept["last.pt"] == kept["ema-00004.pt"] != kept["ema-00002.pt"]
+    for name, rate in kept["last.pt"].items():
+        assert rate == state["training"]["log_rates"][name].exp().item() != pytest.approx(1e-3)
+    assert weights(finished / "ema-00004.pt")[1]["inner_rates"] == {}  # a fixed rate
+
+
+def test_rates_may_be_learned_after_a_training_that_had_no_inner_step_so_far(
+    pair, monkeypatch, capsys
+):
+    argv = [*SHORT, "--data", str(pair), "--pretrain-fraction", "0.5"]
+    learned = ["--learn-inner-lr", "--inner-lr", "0.02", "--rate-lr", "0.3"]
+    train.main([*argv, *learned, "--out", "whole"])
+    stop_after(2, monkeypatch, [*argv, "--out", "resumed"])
+    train.main([*argv, *learned, "--out", "resumed", "--resume"])
+    assert same_bits(whole_state(Path("resumed")), whole_state(Path("whole")))
+    before, after = (
+        weights(f"whole/ema-0000{step}.pt")[1]["inner_rates"].values() for step in (2, 4)
+    )
+    assert list(before) == pytest.approx([0.02] * len(before))
+    assert not any(rate == pytest.approx(0.02) for rate in after)
+    message = fails(train, [*argv, "--out", "resumed", "--resume"], capsys)
+    assert "inner_lr 0.02 -> 0.001, learn_inner_lr True -> False, rate_lr 0.3 -> 0.01" in message
+
+
+def test_inner_steps_on_held_out_episodes_are_taken_with_the_learned_rates(pair, monkeypatch):
+    adapt, used = train.adapt, []
+
+    def watched(loss_fn, params, batch, lr, steps):
+        used.append(lr)
+        return adapt(loss_fn, params, batch, lr, steps)
+
+    monkeypatch.setattr(train, "adapt", watched)
+    options = "--steps 2 --held-out 1 --learn-inner-lr --rate-lr 1 --out run".split()
+    train.main([*SHORT, "--data", str(pair), *options])
+    rates = weights("run/ema-00002.pt")[1]["inner_rates"]
+    assert len(used) == 4  # two tasks, one step and five
+    for lr in used:
+        assert {name: rate.item() for name, rate in lr.items()} == rates
 
 
 # ---- Resuming ------------------------------------------------------------------------------------
@@ -810,6 +919,7 @@ REFUSED = {
     "--num-points 65": "pour has 64 points a cloud, the policy 65",
     "--policy flow --tcfm down": "policy flow needs tcfm 'none', not 'down'",
     "--after-success -1": "--after-success is -1: use at least 0",
+    "--learn-inner-lr --inner-lr 0": "--inner-lr is 0: --learn-inner-lr starts from a rate above",
     "--seed -1": "--seed is -1: use at least 0",
     f"--seed {2**65}": f"--seed is {2**65}: use at most 4294967295",
     "--lr -1": "--lr is -1.0: use at least 0",
