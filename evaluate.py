@@ -19,8 +19,9 @@ P point_dim, A action dim, S state dim.
 """
 
 import argparse
+import copy
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -32,9 +33,11 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.func import functional_call
 
 import baselines  # noqa: F401  (adds its policies to those that can be loaded)
 import common
+import maml
 import model
 from clip import TextWeightsError, text_features
 from common import UserError, progress_bar, report_progress, run_jobs
@@ -88,6 +91,71 @@ DEMONSTRATION_CONTROLS = {
     "no-actions": without_actions,
     "shuffled": shuffled_frames,
 }
+
+# ---- The inner step, as adaptation ---------------------------------------------------------------
+
+
+def inner_rate(info: dict[str, Any], device: str | torch.device) -> maml.InnerRate:
+    """The learning rate of a checkpoint's inner step: one number, or those that it learned."""
+    learned = info.get("inner_rates")
+    if not learned:
+        return info["arguments"]["inner_lr"]
+    return {name: torch.tensor(rate, device=device) for name, rate in learned.items()}
+
+
+def take_inner_steps(
+    policy: DAMIPolicy,
+    sampler: WindowSampler,
+    text: Tensor,
+    *,
+    steps: int,
+    batch: int,
+    lr: maml.InnerRate,
+    seed: int = 0,
+) -> Iterator[tuple[int, float, DAMIPolicy]]:
+    """Adapts a copy of a policy by steps of gradient descent, all on one batch (Eq. 2).
+
+    Args:
+        policy: it is left as it is.
+        sampler: of the task's demonstrations.
+        text: instruction feature, (text_dim,).
+        steps: gradient steps.
+        batch: windows in the batch.
+        lr: the learning rate, or parameter name -> tensor, see `maml.adapt`.
+        seed: of the batch: its demonstration, its windows and their noise.
+
+    Yields:
+        (steps done, loss of the batch after them, the adapted policy) after each step. The policy
+        is always the same object.
+
+    Raises:
+        UserError: the loss is not finite.
+    """
+    adapted = copy.deepcopy(policy)
+    generator = torch.Generator().manual_seed(seed)
+    support = {
+        "text": text[None],
+        **sampler.batch(batch, generator),
+        **adapted.draw_noise_and_timesteps(batch, generator),
+    }
+    support = {name: x.to(text.device) for name, x in support.items()}
+
+    def loss_fn(params: maml.Params, inputs: dict[str, Tensor]) -> Tensor:
+        return functional_call(policy, params, (), inputs)
+
+    params = {name: p.detach() for name, p in policy.named_parameters()}
+    for step in range(1, steps + 1):
+        params = maml.adapt(loss_fn, params, support, lr)
+        with torch.no_grad():
+            loss = loss_fn(params, support)
+        if not torch.isfinite(loss):
+            raise UserError(
+                f"{sampler.task}: the loss is not finite after inner step {step}: use a smaller "
+                "--inner-lr"
+            )
+        adapted.load_state_dict(params, strict=False)  # the normalizer is none of the parameters
+        yield step, loss.item(), adapted
+
 
 # ---- Rollouts ------------------------------------------------------------------------------------
 
@@ -327,6 +395,7 @@ def evaluate_checkpoint(
     device: str | torch.device = "cpu",
     n_demonstrations: int | None = None,
     demonstration_control: str | None = None,
+    inner_steps: int = 0,
     known_goals: bool = False,
     stop_at_success: bool = False,
     config_overrides: dict[str, Any] | None = None,
@@ -346,6 +415,8 @@ def evaluate_checkpoint(
         n_demonstrations: use only the first so many of each recording; None: all.
         demonstration_control: what the policy reads in place of its demonstration, a key of
             DEMONSTRATION_CONTROLS; None: the demonstration.
+        inner_steps: the policy is adapted to each task by so many steps before, with the inner rate
+            and on as many windows as in its training; see `take_inner_steps`.
         known_goals: roll out on the demonstrations' goals, at most `episodes` of them, each once.
         stop_at_success: an episode ends at its first success; it is quicker.
         config_overrides: of the policy's configuration, see `inference_overrides`.
@@ -370,6 +441,7 @@ def evaluate_checkpoint(
                     "text": text[task].cpu().numpy(),  # tensors would be shared, not copied
                     "seeds": seeds[start : start + EPISODES_A_JOB],
                     "demonstration_control": demonstration_control,
+                    "inner_steps": inner_steps,
                     "stop_at_success": stop_at_success,
                 }
             )
@@ -396,8 +468,8 @@ def prepare_worker(
     checkpoint: str | Path, simulator: Simulator, device: str, config_overrides: dict[str, Any]
 ) -> None:
     """Loads the policy in a worker process."""
-    policy, _ = load_trained(checkpoint, device, **config_overrides)
-    worker_state.update(policy=policy, simulator=simulator, task=None)
+    policy, info = load_trained(checkpoint, device, **config_overrides)
+    worker_state.update(policy=policy, info=info, simulator=simulator, task=None)
 
 
 def rollout_job(
@@ -407,6 +479,7 @@ def rollout_job(
     text: np.ndarray,
     seeds: list[int],
     demonstration_control: str | None,
+    inner_steps: int,
     stop_at_success: bool,
 ) -> list[list[bool]]:
     """`rollout` of the episodes of these seeds, of one task, in a worker process."""
@@ -421,6 +494,16 @@ def rollout_job(
             worker_state["simulator"].make(task, policy.config.num_points)
         )
 
+    if inner_steps > 0:
+        info = worker_state["info"]
+        *_, (_, _, policy) = take_inner_steps(
+            policy,
+            worker_state["sampler"],
+            torch.from_numpy(text).to(device),
+            steps=inner_steps,
+            batch=info["arguments"]["support"],
+            lr=inner_rate(info, device),
+        )
     successes = rollout(
         policy,
         environments=worker_state["environments"][: len(seeds)],
@@ -778,6 +861,12 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
     add("--gif", metavar="FILE", help="animate one rollout instead, .gif or .mp4")
+    add(
+        "--inner-steps",
+        type=int,
+        default=0,
+        help="adapt to each task by so many inner steps, as in training, before (default: 0)",
+    )
     add_inference_flags(parser)
     common.add_common_flags(parser)
     return parser.parse_args(argv)
@@ -789,14 +878,17 @@ def check_flags(args: argparse.Namespace) -> None:
         ("demonstrations", args.demonstrations, 1),
         ("episodes", args.episodes, 1),
         ("top", args.top, 0),
+        ("inner-steps", args.inner_steps, 0),
     ):
         if value is not None and value < least:
             raise UserError(f"--{name} is {value}: use at least {least}")
     evaluation_seed(args.seed, args.episodes - 1)  # refuses what is out of range
     if args.gif:
         movie_writer(args.gif)  # refuses what cannot be written
-        if args.known_goals or "demonstration" in args.without:
-            raise UserError("--gif: leave out --known-goals, and --without demonstration")
+        if args.known_goals or "demonstration" in args.without or args.inner_steps:
+            raise UserError(
+                "--gif: leave out --known-goals, --inner-steps, and --without demonstration"
+            )
     if args.swap and args.top:
         raise UserError("--swap measures the last checkpoint alone: leave out --top")
     if args.swap and args.known_goals:
@@ -1031,6 +1123,7 @@ def measure(
             device=device,
             n_demonstrations=args.demonstrations,
             demonstration_control=measurement.demonstration_control,
+            inner_steps=args.inner_steps,
             known_goals=args.known_goals,
             stop_at_success=args.stop_at_success,
             config_overrides=inference_overrides(args),
@@ -1044,6 +1137,7 @@ def measure(
         "seed": args.seed,
         "goals": "of the demonstrations, each once" if args.known_goals else "new",
         "left out": " and ".join(args.without) or "nothing",
+        "inner steps": args.inner_steps,
         "text weights": identity,
         **common.provenance("evaluate.py", argv, device),
         **inference_overrides(args),

@@ -882,7 +882,7 @@ def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int,
     if world == 1:
         return device, 0, 1
     if world > tasks:
-        raise UserError(f"{world} processes for {tasks} tasks a step: use at most one a task")
+        raise UserError(f"{world} processes for {tasks} tasks: use at most one a task")
     if "RANK" not in os.environ:
         raise UserError("WORLD_SIZE is set and RANK is not: start with torchrun, or unset it")
     if device.type == "cuda" and device.index is None:
