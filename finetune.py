@@ -3,11 +3,16 @@
     python finetune.py --task shelf-place            # from the newest run, or the policy that ships
     python finetune.py --task novel                  # all novel tasks of the suite
     python finetune.py --data demos.npz --steps 500  # own demonstrations, in data.py's format
+    python finetune.py --task shelf-place --inner-steps 5    # as meta-training adapts, see below
 
 The EMA policy of meta-training is trained on with AdamW, each step on windows of the task's
 demonstrations and one of them as reference; its three parts have learning rates of their own, and
 there is neither warm-up nor decay. What is kept is an EMA again. A task of a simulator is rolled
 out before and after: the difference is what adaptation bought.
+
+With `--inner-steps`, the adaptation is the one that meta-training differentiates (Eq. 2): so many
+steps of plain gradient descent on one batch of windows, with the inner learning rates of training,
+fixed or learned. The normalizer stays that of training, and nothing is averaged.
 """
 
 import argparse
@@ -22,9 +27,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.func import functional_call
 
 import common
 import evaluate
+import maml
 import model
 import report
 from clip import TextWeightsError
@@ -64,6 +71,12 @@ class Settings:
     lr_vision: float | None = setting(None, "learning rate of the observation encoder", least=0)
     lr_diffusion: float | None = setting(None, "learning rate of the denoiser", least=0)
     lr_other: float | None = setting(None, "learning rate of VMT and U2T", least=0)
+    inner_steps: int | None = setting(
+        None, "in place of AdamW: steps of meta-training's inner loop, on one batch", least=1
+    )
+    inner_lr: float | None = setting(
+        None, "learning rate of these steps (default: that of the training, or those)", least=0
+    )
     instruction: bool = setting(True, "--no-instruction: adapt and roll out without it")
     normalizer: str = setting(
         "fit", "fit it to the task's data, or keep that of training", choices=("fit", "keep")
@@ -159,6 +172,60 @@ def loss_and_gradients(
     return loss.detach(), torch.autograd.grad(loss, list(policy.parameters()))
 
 
+# ---- The adaptation of meta-training, in place of Algorithm 2 ------------------------------------
+
+
+def take_inner_steps(
+    policy: DAMIPolicy,
+    sampler: WindowSampler,
+    text: Tensor,
+    *,
+    steps: int,
+    batch: int,
+    lr: maml.InnerRate,
+    seed: int = 0,
+) -> Iterator[tuple[int, float, DAMIPolicy]]:
+    """Adapts a copy of a policy by steps of gradient descent, all on one batch (Eq. 2).
+
+    Args:
+        policy, sampler, text, seed: as in `adapt_policy`.
+        steps: gradient steps.
+        batch: windows in the batch.
+        lr: the learning rate, or parameter name -> tensor, see `maml.adapt`.
+
+    Yields:
+        (steps done, loss of the batch after them, the adapted policy) after each step. The policy
+        is always the same object.
+
+    Raises:
+        UserError: the loss is not finite.
+    """
+    adapted = copy.deepcopy(policy)
+    generator = torch.Generator().manual_seed(seed)
+    support = {
+        "text": text[None],
+        **sampler.batch(batch, generator),
+        **adapted.draw_noise_and_timesteps(batch, generator),
+    }
+    support = {name: x.to(text.device) for name, x in support.items()}
+
+    def loss_fn(params: maml.Params, inputs: dict[str, Tensor]) -> Tensor:
+        return functional_call(policy, params, (), inputs)
+
+    params = {name: p.detach() for name, p in policy.named_parameters()}
+    for step in range(1, steps + 1):
+        params = maml.adapt(loss_fn, params, support, lr)
+        with torch.no_grad():
+            loss = loss_fn(params, support)
+        if not torch.isfinite(loss):
+            raise UserError(
+                f"{sampler.task}: the loss is not finite after inner step {step}: use a smaller "
+                "--inner-lr"
+            )
+        adapted.load_state_dict(params, strict=False)  # the normalizer is none of the parameters
+        yield step, loss.item(), adapted
+
+
 # ---- From files to files -------------------------------------------------------------------------
 
 
@@ -166,14 +233,33 @@ def resolve(settings: Settings, info: dict[str, Any]) -> Settings:
     """Fills in what the settings leave open: the windows a step, and the learning rates.
 
     Both depend on the training that a checkpoint tells of beside its weights (`info`). The paper's
-    learning rates belong to a meta-training at 1e-4; to another one they are in proportion.
+    learning rates belong to a meta-training at 1e-4; to another one they are in proportion. Inner
+    steps are as in training; where it learned their rates, `inner_lr` stays None.
     """
+    if settings.inner_steps is not None:
+        inner_lr = settings.inner_lr
+        if inner_lr is None and not info.get("inner_rates"):
+            inner_lr = info["arguments"]["inner_lr"]
+        return replace(
+            settings,
+            steps=settings.inner_steps,
+            batch=settings.batch or info["arguments"]["support"],
+            inner_lr=inner_lr,
+            normalizer="keep",
+        )
     scale = info["arguments"]["lr"] / PAPER_LEARNING_RATE
     numbers = {"batch": BATCH[info["preset"]]}
     for part, rate in LEARNING_RATES.items():
         numbers[f"lr_{part}"] = rate * scale
     left_open = {name: x for name, x in numbers.items() if getattr(settings, name) is None}
     return replace(settings, **left_open)
+
+
+def inner_rate(settings: Settings, info: dict[str, Any], device: torch.device) -> maml.InnerRate:
+    """The learning rate of inner steps: one for all tensors, or those that a training learned."""
+    if settings.inner_lr is not None:
+        return settings.inner_lr
+    return {name: torch.tensor(rate, device=device) for name, rate in info["inner_rates"].items()}
 
 
 def log_heldout_error(
@@ -251,19 +337,31 @@ def adapt_checkpoint(
 
     checkpoint_info = {
         **{name: info[name] for name in evaluate.TRAINED},
+        "inner_rates": info.get("inner_rates", {}),
         "adaptation": asdict(settings),
         "adapted_to": demonstrations.task,
         "instruction": demonstrations.instruction,
     }
-    training = adapt_policy(
-        policy,
-        sampler,
-        text,
-        steps=settings.steps,
-        batch=settings.batch,
-        learning_rates={part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES},
-        seed=settings.seed,
-    )
+    if settings.inner_steps is None:
+        training = adapt_policy(
+            policy,
+            sampler,
+            text,
+            steps=settings.steps,
+            batch=settings.batch,
+            learning_rates={part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES},
+            seed=settings.seed,
+        )
+    else:
+        training = take_inner_steps(
+            policy,
+            sampler,
+            text,
+            steps=settings.inner_steps,
+            batch=settings.batch,
+            lr=inner_rate(settings, info, text.device),
+            seed=settings.seed,
+        )
     seconds = 0.0
     began = time.monotonic()
     with common.progress_bar(
@@ -360,6 +458,16 @@ def check_flags(args: argparse.Namespace, settings: Settings) -> None:
         raise UserError("name a task of a simulator with --task, or a recording with --data")
     if args.suite is not None:
         common.choose(args.suite, SIMULATORS, "suite")
+    if settings.inner_steps is None and settings.inner_lr is not None:
+        raise UserError("--inner-lr is the learning rate of --inner-steps: give both")
+    if settings.inner_steps is not None:
+        of_algorithm_2 = ("steps", "curve", "lr_vision", "lr_diffusion", "lr_other")
+        given = [name for name in of_algorithm_2 if getattr(args, name) not in (None, [])]
+        if args.normalizer == "fit":
+            given.append("normalizer")
+        if given:
+            flags = ", ".join(common.flag_name(name) for name in given)
+            raise UserError(f"--inner-steps takes the place of Algorithm 2: leave out {flags}")
     if not all(0 < step < settings.steps for step in args.curve):
         raise UserError(f"--curve: use steps from 1 to {settings.steps - 1}, those before --steps")
 

@@ -538,7 +538,8 @@ def restore(
     policy.load_state_dict(info["training"]["policy"])
     state.average.module.load_state_dict(averaged.state_dict())
     state.average.n_averaged.copy_(info["training"]["n_averaged"])
-    # Before the first inner step the inner rates, and AdamW's second group, are as they begin.
+    # AdamW's second group, that of the inner rates, stays as it was just set up: a run that had no
+    # inner step so far may begin to learn them now.
     optimizer_state = info["training"]["optimizer"]
     optimizer_state["param_groups"][1:] = state.optimizer.state_dict()["param_groups"][1:]
     state.optimizer.load_state_dict(optimizer_state)

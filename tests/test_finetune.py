@@ -148,6 +148,111 @@ def test_two_steps_of_adaptation_are_two_of_plain_adamw_on_gradients_clipped_to_
     assert min(norms) > 1 and max(norms) > 1.05 * min(norms)  # AdamW does not feel a common factor
 
 
+@pytest.mark.parametrize("learned", [False, True])
+def test_inner_steps_are_steps_of_plain_gradient_descent_on_one_batch(learned):
+    torch.manual_seed(0)
+    policy = model.DAMIPolicy(model.PRESETS["tiny"]).double()
+    recording = own_recording(400, ends=[200, 400]) | {"meta": {}}
+    sampler = data.WindowSampler(data.Demonstrations(**recording), policy.config)
+    policy.normalizer.fit([sampler])
+    text, start = torch.randn(512).double(), copy.deepcopy(policy.state_dict())
+    names = [name for name, _ in policy.named_parameters()]
+    rates = torch.linspace(0.01, 0.05, len(names)).double() if learned else [0.02] * len(names)
+    adapting = finetune.take_inner_steps(
+        policy,
+        sampler,
+        text,
+        steps=3,
+        batch=4,
+        lr=dict(zip(names, rates)) if learned else 0.02,
+        seed=7,
+    )
+
+    plain, generator = copy.deepcopy(policy), torch.Generator().manual_seed(7)
+    batch = sampler.batch(4, generator) | plain.draw_noise_and_timesteps(4, generator)
+    for k, (step, loss, adapted) in enumerate(adapting):
+        gradients = torch.autograd.grad(
+            plain.loss(text=text[None], **batch), list(plain.parameters())
+        )
+        with torch.no_grad():
+            for parameter, gradient, rate in zip(plain.parameters(), gradients, rates):
+                parameter -= rate * gradient
+            assert loss == pytest.approx(plain.loss(text=text[None], **batch).item())
+        assert step == k + 1
+        for name, x in adapted.state_dict().items():  # the normalizer's numbers, too
+            assert torch.allclose(x, plain.state_dict()[name], atol=1e-10, rtol=0), name
+    assert step == 3 and same_bits(dict(policy.state_dict()), dict(start))
+
+
+def adapting_by_inner_steps(run, recorded, options="", task="door-close"):
+    """`adapting` with two inner steps in place of two of AdamW."""
+    argv = adapting(run, recorded, f"--inner-steps 2 {options}", task)
+    position = argv.index("--steps")
+    return argv[:position] + argv[position + 2 :]
+
+
+def test_inner_steps_are_as_those_of_the_training_and_keep_its_normalizer(run, recorded):
+    argv = adapting_by_inner_steps(run, recorded)
+    finetune.main([*argv, "--out", "inner"])
+    written = json.loads(Path("inner/config.json").read_text())
+    expected = {"steps": 2, "batch": 4, "inner_lr": 1e-3, "normalizer": "keep", "lr_other": None}
+    assert {name: written[name] for name in expected} == expected  # the preset tiny's
+    assert [line["step"] for line in metrics(Path("inner"))] == [1, 2]
+    finetune.main([*argv, "--inner-lr", "1e-3", "--batch", "4", "--out", "same"])
+    finetune.main([*argv, "--inner-lr", "0", "--out", "unmoved"])
+    old, new, same, unmoved = (
+        dict(weights(path)[0])
+        for path in (
+            run / "ema-00006.pt",
+            *(f"{n}/adapted.pt" for n in ("inner", "same", "unmoved")),
+        )
+    )
+    assert same_bits(new, same) and same_bits(old, unmoved)
+    unchanged = {name for name in old if torch.equal(old[name], new[name])}
+    assert unchanged == {name for name in old if name.startswith("normalizer")}
+
+
+def test_inner_steps_are_taken_with_the_rates_that_were_learned(run, recorded):
+    info = torch.load(run / "ema-00006.pt", weights_only=True)
+    policy, _ = model.load(run / "ema-00006.pt")
+    rates = {name: 0.0 for name, _ in policy.named_parameters()} | {"denoiser.head.1.bias": 0.25}
+    torch.save(info | {"inner_rates": rates}, "learned.pt")
+    argv = [*adapting_by_inner_steps(run, recorded), "--checkpoint", "learned.pt"]
+    finetune.main([*argv, "--out", "learned"])
+    finetune.main([*argv, "--inner-lr", "0.25", "--out", "one-rate"])
+    old = weights("learned.pt")[0]
+
+    def moved(new):
+        return {name for name in old if not torch.equal(old[name], new[name])}
+
+    adapted, kept = weights("learned/adapted.pt")
+    assert moved(adapted) == {"denoiser.head.1.bias"} and kept["inner_rates"] == rates
+    assert moved(weights("one-rate/adapted.pt")[0]) == rates.keys()
+
+
+def test_inner_steps_on_several_tasks_are_rolled_out_and_resumed(
+    run, recorded, monkeypatch, capsys
+):
+    calls = evaluated(monkeypatch, lambda checkpoint: [checkpoint.stem == "adapted"])
+    argv = adapting_by_inner_steps(run, recorded, "--episodes 1 --out both", "door-close reach")
+    finetune.main(argv)
+    successes = json.loads(Path("both/success.json").read_text())["successes"]
+    assert successes["after"] == {"door-close": [True], "reach": [True]}
+    assert successes["before"] == {"door-close": [False], "reach": [False]}
+    assert len(calls) == 4
+    message = fails(finetune, [*argv, "--resume", "--inner-lr", "0.5"], capsys)
+    assert "was made with another inner_lr" in message
+    finetune.main([*argv, "--resume"])
+    assert len(calls) == 4
+
+
+def test_inner_steps_that_diverge_stop_and_write_no_policy(run, recorded, capsys):
+    argv = adapting_by_inner_steps(run, recorded, "--inner-lr 1e30")
+    message = fails(finetune, argv, capsys)
+    assert "door-close: the loss is not finite after inner step 1" in message
+    assert not list(Path().rglob("adapted.pt"))
+
+
 def test_the_papers_learning_rates_belong_to_its_meta_training_and_are_scaled_to_this_one(
     run, recorded
 ):
@@ -289,6 +394,11 @@ REFUSED = {
     "--task shelf-place --seed 1000": "--seed is 1000: use at most 999",
     "--task shelf-place --checkpoint none.pt": "none.pt",
     "--task shelf-place --curve 5 500": "--curve: use steps from 1 to 199",
+    "--task shelf-place --inner-steps 0": "--inner-steps is 0: use at least 1",
+    "--task shelf-place --inner-lr 1": "--inner-lr is the learning rate of --inner-steps",
+    "--task shelf-place --inner-steps 1 --steps 9 --curve 300": "2: leave out --steps, --curve",
+    "--task shelf-place --inner-steps 1 --lr-vision 0": "2: leave out --lr-vision",
+    "--task shelf-place --inner-steps 1 --normalizer fit": "2: leave out --normalizer",
     "--data missing.npz": "missing.npz is missing",
     "--data own.npz --task stir": "no finished run on own",
     "--data own.npz --task shelf-place": "no finished run on own",
