@@ -27,11 +27,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import functional_call
 
 import common
 import evaluate
-import maml
 import model
 import report
 from clip import TextWeightsError
@@ -172,60 +170,6 @@ def loss_and_gradients(
     return loss.detach(), torch.autograd.grad(loss, list(policy.parameters()))
 
 
-# ---- The adaptation of meta-training, in place of Algorithm 2 ------------------------------------
-
-
-def take_inner_steps(
-    policy: DAMIPolicy,
-    sampler: WindowSampler,
-    text: Tensor,
-    *,
-    steps: int,
-    batch: int,
-    lr: maml.InnerRate,
-    seed: int = 0,
-) -> Iterator[tuple[int, float, DAMIPolicy]]:
-    """Adapts a copy of a policy by steps of gradient descent, all on one batch (Eq. 2).
-
-    Args:
-        policy, sampler, text, seed: as in `adapt_policy`.
-        steps: gradient steps.
-        batch: windows in the batch.
-        lr: the learning rate, or parameter name -> tensor, see `maml.adapt`.
-
-    Yields:
-        (steps done, loss of the batch after them, the adapted policy) after each step. The policy
-        is always the same object.
-
-    Raises:
-        UserError: the loss is not finite.
-    """
-    adapted = copy.deepcopy(policy)
-    generator = torch.Generator().manual_seed(seed)
-    support = {
-        "text": text[None],
-        **sampler.batch(batch, generator),
-        **adapted.draw_noise_and_timesteps(batch, generator),
-    }
-    support = {name: x.to(text.device) for name, x in support.items()}
-
-    def loss_fn(params: maml.Params, inputs: dict[str, Tensor]) -> Tensor:
-        return functional_call(policy, params, (), inputs)
-
-    params = {name: p.detach() for name, p in policy.named_parameters()}
-    for step in range(1, steps + 1):
-        params = maml.adapt(loss_fn, params, support, lr)
-        with torch.no_grad():
-            loss = loss_fn(params, support)
-        if not torch.isfinite(loss):
-            raise UserError(
-                f"{sampler.task}: the loss is not finite after inner step {step}: use a smaller "
-                "--inner-lr"
-            )
-        adapted.load_state_dict(params, strict=False)  # the normalizer is none of the parameters
-        yield step, loss.item(), adapted
-
-
 # ---- From files to files -------------------------------------------------------------------------
 
 
@@ -253,13 +197,6 @@ def resolve(settings: Settings, info: dict[str, Any]) -> Settings:
         numbers[f"lr_{part}"] = rate * scale
     left_open = {name: x for name, x in numbers.items() if getattr(settings, name) is None}
     return replace(settings, **left_open)
-
-
-def inner_rate(settings: Settings, info: dict[str, Any], device: torch.device) -> maml.InnerRate:
-    """The learning rate of inner steps: one for all tensors, or those that a training learned."""
-    if settings.inner_lr is not None:
-        return settings.inner_lr
-    return {name: torch.tensor(rate, device=device) for name, rate in info["inner_rates"].items()}
 
 
 def log_heldout_error(
@@ -353,13 +290,14 @@ def adapt_checkpoint(
             seed=settings.seed,
         )
     else:
-        training = take_inner_steps(
+        inner_lr = settings.inner_lr
+        training = evaluate.take_inner_steps(
             policy,
             sampler,
             text,
             steps=settings.inner_steps,
             batch=settings.batch,
-            lr=inner_rate(settings, info, text.device),
+            lr=evaluate.inner_rate(info, text.device) if inner_lr is None else inner_lr,
             seed=settings.seed,
         )
     seconds = 0.0

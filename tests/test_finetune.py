@@ -158,7 +158,7 @@ def test_inner_steps_are_steps_of_plain_gradient_descent_on_one_batch(learned):
     text, start = torch.randn(512).double(), copy.deepcopy(policy.state_dict())
     names = [name for name, _ in policy.named_parameters()]
     rates = torch.linspace(0.01, 0.05, len(names)).double() if learned else [0.02] * len(names)
-    adapting = finetune.take_inner_steps(
+    adapting = evaluate.take_inner_steps(
         policy,
         sampler,
         text,
