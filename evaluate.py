@@ -618,6 +618,7 @@ def evaluate_heldout(
 # ---- Animations ----------------------------------------------------------------------------------
 
 FPS = 30
+FILMS = 3  # below each other
 
 
 @dataclass(frozen=True)
@@ -664,78 +665,90 @@ class FilmedEnvironment:
 def write_animation(
     policy: DAMIPolicy,
     simulator: Simulator,
-    sampler: WindowSampler,
-    text: Tensor,
+    samplers: Sequence[WindowSampler],
+    text: dict[str, Tensor],
     *,
     seed: int,
     path: str | Path,
-) -> list[bool]:
-    """Rolls out one whole episode and animates it: the picture, and what the policy sees beside it.
+) -> list[list[bool]]:
+    """Rolls out one whole episode of each sampler's task, and animates them below each other.
+
+    Each row has the picture, and what the policy sees beside it. All episodes have the same seed:
+    where tasks are hidden goals they begin alike, and only their demonstrations differ.
 
     Args:
         policy: in evaluation mode.
-        simulator: has the sampler's task.
-        sampler: of the task's demonstrations, one of which is the reference.
-        text: instruction feature, (text_dim,).
-        seed: of goal, reference demonstration and noise: `evaluation_seed(seed, 0)`.
+        simulator: has the samplers' tasks.
+        samplers: of the tasks' demonstrations, one of which is the reference of each rollout.
+        text: task -> instruction feature, (text_dim,).
+        seed: of start, goal, reference demonstration and noise: `evaluation_seed(seed, 0)`.
         path: of the animation, .gif or .mp4; see `movie_writer`.
 
     Returns:
-        Whether each step reported success.
+        For each sampler, whether each step reported success.
     """
     writer = movie_writer(path)
     episode_seed = evaluation_seed(seed, 0)
+    films, successes = {}, []
     with progress_bar(desc="rolling out", unit="step") as progress:
-        environment = FilmedEnvironment(
-            simulator.make(sampler.task, policy.config.num_points), on_step=progress.update
-        )
-        [successes] = rollout(
-            policy,
-            environments=[environment],
-            seeds=[episode_seed],
-            sampler=sampler,
-            text=text,
-            generator=torch.Generator().manual_seed(episode_seed),
-        )
-    environment.film()  # how it ended
-    animate(environment.frames, sampler.task, writer, path)
+        for sampler in samplers:
+            environment = FilmedEnvironment(
+                simulator.make(sampler.task, policy.config.num_points), on_step=progress.update
+            )
+            successes += rollout(
+                policy,
+                environments=[environment],
+                seeds=[episode_seed],
+                sampler=sampler,
+                text=text[sampler.task],
+                generator=torch.Generator().manual_seed(episode_seed),
+            )
+            environment.film()  # how it ended
+            films[sampler.task] = environment.frames
+    animate(films, writer, path)
     return successes
 
 
-def animate(frames: Sequence[Frame], task: str, writer: Any, path: str | Path) -> None:
-    """Writes frames as an animation, with a writer of Matplotlib; the last one stays a while.
+def animate(films: dict[str, Sequence[Frame]], writer: Any, path: str | Path) -> None:
+    """Writes films, task -> frames, as an animation, with a writer of Matplotlib.
 
-    The title says which of the frames are a success.
+    There is a row for each film, whose title says which of its frames are a success. The last frame
+    stays a while.
     """
     from matplotlib.animation import FuncAnimation
     from matplotlib.figure import Figure
 
-    clouds = np.concatenate([frame.cloud for frame in frames])
+    clouds = np.concatenate([frame.cloud for frames in films.values() for frame in frames])
     low, high = clouds.min(axis=0), clouds.max(axis=0)
-    figure = Figure(figsize=(6, 3), layout="constrained")
-    left = figure.add_subplot(1, 2, 1)
-    right = figure.add_subplot(1, 2, 2, projection="3d")
+    figure = Figure(figsize=(6, 3 * len(films)), layout="constrained")
+    rows = []
+    for row in range(len(films)):
+        picture = figure.add_subplot(len(films), 2, 2 * row + 1)
+        cloud = figure.add_subplot(len(films), 2, 2 * row + 2, projection="3d")
+        rows.append((picture, cloud))
 
-    def show(frame: Frame) -> None:
-        left.clear()
-        left.imshow(frame.picture)
-        left.set_axis_off()
-        left.set_title(f"{task}: success" if frame.success else task, fontsize=9)
+    def show(index: int) -> None:
+        for (task, frames), (left, right) in zip(films.items(), rows):
+            frame = frames[min(index, len(frames) - 1)]
+            left.clear()
+            left.imshow(frame.picture)
+            left.set_axis_off()
+            left.set_title(f"{task}: success" if frame.success else task, fontsize=9)
 
-        right.clear()
-        height = frame.cloud[:, 2]
-        right.scatter(*frame.cloud.T, c=height, vmin=low[2], vmax=high[2], cmap="viridis", s=9)
-        right.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        right.set(xticklabels=[], yticklabels=[], zticklabels=[])
-        right.set_box_aspect(high - low)
-        right.view_init(elev=25, azim=-30)
-        right.set_title(f"{len(frame.cloud)} points, step {frame.step}", fontsize=9)
+            right.clear()
+            height = frame.cloud[:, 2]
+            right.scatter(*frame.cloud.T, c=height, vmin=low[2], vmax=high[2], cmap="viridis", s=9)
+            right.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+            right.set(xticklabels=[], yticklabels=[], zticklabels=[])
+            right.set_box_aspect(high - low)
+            right.view_init(elev=25, azim=-30)
+            right.set_title(f"{len(frame.cloud)} points, step {frame.step}", fontsize=9)
 
-    shown = [*frames, *[frames[-1]] * 10]
+    shown = max(len(frames) for frames in films.values()) + 10
     animation = FuncAnimation(figure, show, frames=shown)
 
     def save(temporary: Path) -> None:
-        with progress_bar(desc="drawing", unit="frame", total=len(shown)) as progress:
+        with progress_bar(desc="drawing", unit="frame", total=shown) as progress:
             animation.save(
                 temporary,
                 writer=writer,
@@ -860,7 +873,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     )
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
-    add("--gif", metavar="FILE", help="animate one rollout instead, .gif or .mp4")
+    add("--gif", metavar="FILE", help="animate one rollout a task instead, .gif or .mp4")
     add(
         "--inner-steps",
         type=int,
@@ -1070,27 +1083,32 @@ def watch(
     checkpoint: Checkpoint,
     simulator: Simulator,
     suite: str,
-    task: str,
+    tasks: Sequence[str],
     device: torch.device,
 ) -> None:
-    """--gif: animates one rollout."""
-    if "adapted_to" not in checkpoint.info and task in simulator.tasks(suite)[1]:
-        adapt = f"python finetune.py --task {task}"
-        print(f"{task} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
+    """--gif: animates one rollout of each task."""
+    _, novel = simulator.tasks(suite)
+    needs_adaptation = checkpoint.info["arguments"].get("evaluate_on") != "novel"
+    for task in tasks:
+        if "adapted_to" not in checkpoint.info and task in novel and needs_adaptation:
+            adapt = f"python finetune.py --task {task}"
+            print(f"{task} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
     policy, info = load_trained(checkpoint.path, device, **inference_overrides(args))
-    recordings, text, _ = load_inputs(args, simulator, [task], info, device)
-    demonstrations = load_demonstrations(recordings[task]).take(args.demonstrations)
-    sampler = WindowSampler(demonstrations, policy.config, device=device)
-    successes = write_animation(
-        policy, simulator, sampler, text[task], seed=args.seed, path=args.gif
-    )
-    if successes[-1]:
-        outcome = "success at the end"
-    elif any(successes):
-        outcome = "success, but not at the end"
-    else:
-        outcome = "failure"
-    print(f"{task}: {outcome}; wrote {args.gif}")
+    recordings, text, _ = load_inputs(args, simulator, tasks, info, device)
+    samplers = []
+    for task in tasks:
+        demonstrations = load_demonstrations(recordings[task]).take(args.demonstrations)
+        samplers.append(WindowSampler(demonstrations, policy.config, device=device))
+    successes = write_animation(policy, simulator, samplers, text, seed=args.seed, path=args.gif)
+    for task, steps in zip(tasks, successes):
+        if steps[-1]:
+            outcome = "success at the end"
+        elif any(steps):
+            outcome = "success, but not at the end"
+        else:
+            outcome = "failure"
+        print(f"{task}: {outcome}")
+    print(f"wrote {args.gif}")
 
 
 def measure(
@@ -1151,6 +1169,7 @@ def measure(
         parts=parts,
         paper=paper_columns(suite, dict.fromkeys(run[-1].policy for run in runs)),
         checkpoints=outcomes if args.top else None,
+        pooled=info["arguments"].get("evaluate_on") == "novel" and len(outcomes) > 1,
     )
     print(f"\n{table}\n")
     for name, value in provenance.items():
@@ -1178,14 +1197,16 @@ def main(argv: list[str] | None = None) -> None:
         raise UserError("--swap takes from another task of a split: leave out --task")
 
     if args.gif:
-        if len(tasks) > 1:
-            raise UserError("--gif draws one rollout: name its task, --task reach --gif reach.gif")
+        if len(tasks) > FILMS:
+            raise UserError(
+                f"--gif draws at most {FILMS} rollouts: name their tasks, --task reach --gif x.gif"
+            )
         watch(
             args,
             checkpoint=runs[0][-1],
             simulator=simulator,
             suite=suite,
-            task=tasks[0],
+            tasks=tasks,
             device=device,
         )
         return

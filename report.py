@@ -112,17 +112,22 @@ def paper_columns(suite: str, policies: Iterable[str]) -> PaperColumns:
 
 
 def success_table(
-    columns: dict[str, Successes], parts: Parts | None = None, paper: PaperColumns | None = None
+    columns: dict[str, Successes],
+    parts: Parts | None = None,
+    paper: PaperColumns | None = None,
+    of: str = "task",
 ) -> str:
     """A Markdown table: a row for each task, and one for the mean of each part.
 
     Args:
         columns: title -> results; all of them of the same tasks.
         parts: see `Parts`; by default there is one mean, that of all tasks. A single task has none.
+        of: what the rows are of.
         paper: more columns, see `paper_columns`; those that have none of the tasks are left out.
     """
     tasks = list(next(iter(columns.values())))
-    parts = parts or {"mean": tasks}
+    if parts is None:
+        parts = {"mean": tasks}
     paper = with_any_of(tasks, paper or {})
 
     def row(title: str, row_tasks: Sequence[str]) -> list[str]:
@@ -134,7 +139,7 @@ def success_table(
             cells.append(f"{np.mean(known):.1f}" if len(known) == len(row_tasks) else "")
         return cells
 
-    rows = [["task", *columns, *paper]]
+    rows = [[of, *columns, *paper]]
     rows += [row(task, [task]) for task in tasks]
     if len(tasks) > 1:
         rows += [row(f"**{name}**", part_tasks) for name, part_tasks in parts.items()]
@@ -185,6 +190,7 @@ def write_report(
     parts: Parts | None = None,
     paper: PaperColumns | None = None,
     checkpoints: dict[str, Outcomes] | None = None,
+    pooled: bool = False,
 ) -> str:
     """Writes success.json, success.md and success.png to a folder, and returns the table.
 
@@ -195,15 +201,22 @@ def write_report(
         parts, paper: see `success_table`.
         provenance: how the results were measured, name -> value; "title" is the chart's.
         checkpoints: label -> results of other checkpoints; they go only into success.json.
+        pooled: table and chart put the episodes of all tasks together: a row for each label.
     """
     any_step = {label: outcome.any_step for label, outcome in outcomes.items()}
     at_end = {
         label: outcome.at_end for label, outcome in outcomes.items() if outcome.at_end is not None
     }
-    columns = dict(any_step)
-    for label, successes in at_end.items():
-        columns[f"{label}, at the end"] = successes
-    table = success_table(columns, parts, paper)
+    if pooled:
+        columns = {"any step": pool_tasks(any_step)}
+        if at_end:
+            columns["at the end"] = pool_tasks(at_end)
+        table = success_table(columns, parts={}, of="success, percent")
+    else:
+        columns = dict(any_step)
+        for label, successes in at_end.items():
+            columns[f"{label}, at the end"] = successes
+        table = success_table(columns, parts, paper)
     report = {"provenance": provenance, "successes": any_step, "successes at the end": at_end}
     if checkpoints:
         report["checkpoints"] = {label: outcome.any_step for label, outcome in checkpoints.items()}
@@ -218,6 +231,14 @@ def write_report(
     )
     plot_success(columns, folder / "success.png", provenance.get("title", "Success"), paper)
     return table
+
+
+def pool_tasks(results: dict[str, Successes]) -> Successes:
+    """Label -> the episodes of all its tasks, one after the other."""
+    return {
+        label: [success for episodes in successes.values() for success in episodes]
+        for label, successes in results.items()
+    }
 
 
 def read_outcomes(folder: Path) -> dict[str, Outcomes]:

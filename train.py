@@ -581,6 +581,19 @@ class Evaluation:
     workers: int | None
     device: torch.device
 
+    def roll_out(self, checkpoint: Path, **options: Any) -> Outcomes:
+        """Rolls a checkpoint out; `options` are those of `evaluate.evaluate_checkpoint`."""
+        defaults = {
+            "recordings": self.recordings,
+            "text": {task: self.text[task] for task in self.recordings},
+            "episodes": self.settings.episodes,
+            "seed": evaluate.EVALUATION_SEED,
+            "workers": self.workers,
+            "device": self.device,
+            "n_demonstrations": self.n_demonstrations,
+        }
+        return evaluate.evaluate_checkpoint(checkpoint, self.simulator, **{**defaults, **options})
+
     def run(self, step: int, stop: StopRequest) -> Outcomes | None:
         """Rolls out the checkpoint of a step and logs the outcomes, or reads them from the log.
 
@@ -595,17 +608,7 @@ class Evaluation:
                 return Outcomes(line["successes"], line["successes_at_end"])
         try:
             with stop.suspended():
-                outcomes = evaluate.evaluate_checkpoint(
-                    checkpoint=self.folder / f"ema-{step:05d}.pt",
-                    simulator=self.simulator,
-                    recordings=self.recordings,
-                    text={task: self.text[task] for task in self.recordings},
-                    episodes=settings.episodes,
-                    seed=evaluate.EVALUATION_SEED,
-                    workers=self.workers,
-                    device=self.device,
-                    n_demonstrations=self.n_demonstrations,
-                )
+                outcomes = self.roll_out(self.folder / f"ema-{step:05d}.pt")
         except KeyboardInterrupt:
             raise KeyboardInterrupt("all is saved, add --resume to go on") from None
         append_json(
@@ -617,6 +620,47 @@ class Evaluation:
             successes_at_end=outcomes.at_end,
         )
         return outcomes
+
+    def contributions(
+        self, own: Outcomes, reads_demonstration: bool, stop: StopRequest
+    ) -> dict[str, Outcomes]:
+        """What demonstration and inner step do on tasks that no observation names.
+
+        Title -> outcomes of the last checkpoint: with each task's own demonstration (`own`, which
+        is measured already), with that of another task, and without any; then the same after an
+        inner step, if there was any in training. Also animates the first two tasks, from one start.
+        """
+        settings = self.settings
+        checkpoint = self.folder / f"ema-{settings.steps:05d}.pt"
+        inputs: dict[str, dict[str, Any]] = {"no demonstration": {}}
+        if reads_demonstration:
+            inputs = {
+                "own demonstration": {},
+                "another task's": {"recordings": evaluate.of_next_task(self.recordings)},
+                "none": {"demonstration_control": "zeros"},
+            }
+        columns = {}
+        with stop.suspended():
+            for title, options in inputs.items():
+                measured = own if not options else self.roll_out(checkpoint, **options)
+                columns[title] = measured
+            if settings.pretrain_steps < settings.steps:
+                for title, options in inputs.items():
+                    measured = self.roll_out(checkpoint, **options, inner_steps=1)
+                    columns[f"{title}, after an inner step"] = measured
+            self.animate(checkpoint)
+        return columns
+
+    def animate(self, checkpoint: Path) -> None:
+        """Writes goals.gif: the first two tasks, from one start."""
+        policy, _ = evaluate.load_trained(checkpoint, self.device)
+        samplers = [
+            WindowSampler(load_demonstrations(path), policy.config, device=self.device)
+            for path in list(self.recordings.values())[:2]
+        ]
+        evaluate.write_animation(
+            policy, self.simulator, samplers, self.text, seed=0, path=self.folder / "goals.gif"
+        )
 
 
 def log_heldout_errors(
@@ -720,14 +764,14 @@ def report_training(
     policy: str,
     seconds: float,
     provenance: dict[str, Any],
-    outcomes: Outcomes | None,
+    columns: dict[str, Outcomes],
 ) -> None:
     """Writes and prints the results of a finished run, and prints what can be done with it."""
-    if outcomes is not None:
+    if columns:
         report.plot_curves(folder)
         table = report.write_report(
             folder,
-            {"last checkpoint": outcomes},
+            columns,
             {
                 "title": f"{settings.suite}, {settings.evaluate_on} tasks, "
                 f"{settings.preset}, {policy}",
@@ -738,6 +782,7 @@ def report_training(
                 **provenance,
             },
             paper=report.paper_columns(settings.suite, [policy]),
+            pooled=settings.evaluate_on == "novel",
         )
         print(f"\n{table}")
     if (folder / "held-out.md").exists():
@@ -1063,8 +1108,14 @@ def run(
             if rank == 0:
                 outcomes = evaluation.run(state.step, stop)
             began = time.monotonic()
+
+        columns = {}
+        if outcomes is not None and settings.evaluate_on == "novel":
+            columns = evaluation.contributions(outcomes, state.policy.reads_demonstration, stop)
+        elif outcomes is not None:
+            columns = {"last checkpoint": outcomes}
     if rank == 0:
-        report_training(folder, settings, config.policy, state.seconds, provenance, outcomes)
+        report_training(folder, settings, config.policy, state.seconds, provenance, columns)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         facts = provenance(
             "-m", ["tests.controls", *(sys.argv[1:] if argv is None else argv)], "cpu"
         )
-        print(write_report(out, outcomes, {"title": f"{args.suite}, no network", **facts}))
+        print(write_report(out, outcomes, {"title": "no network", **facts}, pooled=True))
 
 
 if __name__ == "__main__":

@@ -337,6 +337,7 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
             text=np.zeros(512, np.float32),
             seeds=[simulator.evaluation_seed(0, episode)],
             demonstration_control=None,
+            inner_steps=0,
             stop_at_success=True,
         )
         return np.stack(frames)
@@ -624,6 +625,7 @@ def test_what_the_command_line_says_reaches_the_rollouts(run, recordings, traine
         "device": torch.device("cpu"),
         "n_demonstrations": 2,
         "demonstration_control": None,
+        "inner_steps": 0,
         "known_goals": True,
         "stop_at_success": True,
         "config_overrides": {"sampler": "ddim"},
@@ -709,7 +711,7 @@ def test_old_results_stay_where_the_new_ones_are_refused(run, recordings, monkey
 
 
 def test_a_rollout_can_be_watched(run, recordings, capsys):
-    evaluate.main(command(run, recordings, "--task touch-red --gif x.gif"))
+    evaluate.main(command(run, recordings, "--task touch-red touch-green --gif x.gif"))
     assert Path("x.gif").read_bytes().startswith(b"GIF8")
     assert Path("x.gif").stat().st_size > 10_000
     printed = capsys.readouterr()
@@ -720,7 +722,7 @@ def test_a_rollout_can_be_watched(run, recordings, capsys):
 
 def test_every_second_step_and_the_last_moment_are_filmed(trained, recordings, monkeypatch):
     films = []
-    monkeypatch.setattr(evaluate, "animate", lambda frames, task, *_: films.append((frames, task)))
+    monkeypatch.setattr(evaluate, "animate", lambda of_tasks, *_: films.append(of_tasks))
     sampler = data.WindowSampler(data.load_demonstrations(recordings["touch-red"]), TINY)
     made = []
 
@@ -730,10 +732,11 @@ def test_every_second_step_and_the_last_moment_are_filmed(trained, recordings, m
             return made[-1]
 
     text, _ = features(["touch-red"], None, None)
-    successes = evaluate.write_animation(
-        trained, Kept(), sampler, text[0], seed=2, path=Path("x.gif")
+    [successes] = evaluate.write_animation(
+        trained, Kept(), [sampler], {"touch-red": text[0]}, seed=2, path=Path("x.gif")
     )
-    [(frames, task)], [environment] = films, made
+    [film], [environment] = films, made
+    [(task, frames)] = film.items()
     assert task == "touch-red" and environment.steps == len(successes) == 12
     assert [frame.step for frame in frames] == [*range(0, environment.steps, 2), environment.steps]
     outcome_before = [False, *successes]  # nothing is told before it happens
@@ -759,7 +762,7 @@ def test_an_adapted_policy_is_watched_from_its_folder(
     monkeypatch.setattr(
         evaluate,
         "write_animation",
-        lambda p, s, sampler, *_, **__: (seen.append(sampler.task), [False])[1],
+        lambda p, s, samplers, *_, **__: (seen.append(samplers[0].task), [[False]])[1],
     )
     Path("all/touch-blue").mkdir(parents=True)
     model.save("all/touch-blue/adapted.pt", trained, **{**INFO, "adapted_to": "touch-blue"})
@@ -803,7 +806,7 @@ def test_a_movie_is_written_by_what_is_there(monkeypatch):
         ("--swap instruction --top 2", "leave out --top"),
         ("--swap instruction --known-goals", "leave out --swap"),
         ("--swap instruction --task touch-red", "leave out --task"),
-        ("--gif x.gif", "name its task"),
+        ("--gif x.gif --split all --task touch-red touch-green touch-blue touch-red", "at most 3"),
         ("--gif x.gif --task touch-red --known-goals", "leave out --known-goals"),
         ("--gif x.gif --task touch-red --without demonstration", "--without demonstration"),
         ("--gif x.avi --task touch-red", "name it .gif or .mp4"),
