@@ -3,6 +3,7 @@
     python -m tests.runs --list              # what there is, and what is done
     python -m tests.runs --only dami neither # two at a time, one thread each
     python -m tests.runs                     # all of it
+    python -m tests.runs --suite goals-reach --seeds 0 1 2 3 4   # where goals are hidden
 
 A variant is a set of flags of train.py, a run is a variant and a seed. A run is trained, then
 measured: base tasks as they are, novel tasks along their adaptation, and what swapping the
@@ -17,13 +18,14 @@ import sys
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
 
 from common import choose, command_line
 from tests.oracle import WORLDS
+from train import SETTINGS, SUITE_SETTINGS
 
 NEITHER = "--demo-encoder none --maml off"  # multi-task training
 METHOD = {  # a variant of the method -> its flags of train.py
@@ -107,6 +109,43 @@ for name, flags in CURVE.items():
     REPORTS[name] = (f"finetune.py --task novel --checkpoint {{run}} --episodes 20 {flags}", SHOWN)
 
 
+# Where goals are hidden: who reads a demonstration, and who is adapted by an inner step.
+INNER = "--learn-inner-lr --inner-lr 3e-2 --pretrain-fraction 0.3"
+HIDDEN_METHOD = {
+    "demonstration": "--maml off",
+    "neither": NEITHER,
+    "inner": f"--demo-encoder none {INNER}",
+    "inner-first-order": f"--demo-encoder none --maml first {INNER}",
+    "both": INNER,
+}
+ADAPTED = ("neither", "inner", "inner-first-order", "both")
+NOVEL = "evaluate.py --split novel --checkpoint {run}"
+HIDDEN_REPORTS = {
+    "novel": (f"{NOVEL} --swap demonstration --controls zeros", ("demonstration", "both")),
+    "parts": (f"{NOVEL} --controls last-frame no-actions shuffled", ("demonstration",)),
+    "0-steps": (NOVEL, ("neither", "inner", "inner-first-order")),
+    "1-step": (f"{NOVEL} --inner-steps 1", ADAPTED),
+    "5-steps": (f"{NOVEL} --inner-steps 5", ADAPTED),
+    "adamw": ("finetune.py --task novel --checkpoint {run} --curve 1 5 20", tuple(HIDDEN_METHOD)),
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is trained on a suite, and how it is measured."""
+
+    variants: dict[str, str]  # name -> flags of train.py
+    reports: dict[str, tuple[str, Sequence[str]]]  # see REPORTS
+    episodes: int  # of a task
+
+
+def plan_of(suite: str) -> Plan:
+    """The plan of a suite: that of hidden goals, or that of ML10 and ML45."""
+    if suite.startswith("goals-"):
+        return Plan(HIDDEN_METHOD, HIDDEN_REPORTS, episodes=5)
+    return Plan(VARIANTS, REPORTS, episodes=EPISODES)
+
+
 @dataclass(frozen=True)
 class Job:
     """A command whose result is a file."""
@@ -124,9 +163,20 @@ class Job:
             return subprocess.run(words, stdout=log, stderr=log).returncode
 
 
-def jobs_of_run(variant: str, seed: int, *, suite: str, steps: int, episodes: int) -> list[Job]:
-    """The jobs of a run in their order: its training, then the reports that measure it."""
-    flags = VARIANTS[variant]
+def steps_of(suite: str, flags: str) -> int:
+    """How many outer steps a training with these flags takes."""
+    given = re.findall(r"--steps (\d+)", flags)
+    preset = replace(SETTINGS["small"], **SUITE_SETTINGS.get(suite, {}))
+    return int(given[-1]) if given else preset.steps
+
+
+def jobs_of_run(variant: str, seed: int, *, suite: str, flags: str, episodes: int) -> list[Job]:
+    """The jobs of a run in their order: its training, then the reports that measure it.
+
+    `flags` are those of the training, beside the variant's.
+    """
+    plan = plan_of(suite)
+    flags = f"{plan.variants[variant]} {flags}"
     run = Path(f"runs/{suite}-{variant}-seed{seed}")
     log = run.with_suffix(".log")
 
@@ -137,13 +187,13 @@ def jobs_of_run(variant: str, seed: int, *, suite: str, steps: int, episodes: in
         data = "".join(re.findall(r" --data \S+", flags))
 
     resume = " --resume" if (run / "last.pt").exists() else ""
-    steps = int(re.findall(r"--steps (\d+)", f"--steps {steps} {flags}")[-1])
+    steps = steps_of(suite, flags)
     training = (
         f"{world}train.py --suite {suite} --preset small --seed {seed} --episodes 0 "
-        f"--out {run} --threads 1 --steps {steps} --clip-weights random {flags}{resume}"
+        f"--out {run} --threads 1 --clip-weights random {flags}{resume}"
     )
     jobs = [Job(training, done=run / f"ema-{steps:05d}.pt", log=log)]
-    for name, (command, variants) in REPORTS.items():
+    for name, (command, variants) in plan.reports.items():
         if variant not in variants:
             continue
         out = Path(f"{run}-{name}")
@@ -173,22 +223,25 @@ def run_in_order(jobs: Sequence[Job], stopped: threading.Event) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Trains and measures what RESULTS.md shows.")
-    parser.add_argument("--only", nargs="+", default=list(VARIANTS), help="these variants")
+    parser.add_argument("--only", nargs="+", help="these variants (all)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of training")
-    parser.add_argument("--suite", default="ml10", help="ml10 or ml45")
-    parser.add_argument("--steps", type=int, default=8_000, help="of each training")
-    parser.add_argument("--episodes", type=int, default=EPISODES, help="a task")
+    parser.add_argument("--suite", default="ml10", help="such as ml10 or goals-reach (ml10)")
+    parser.add_argument("--flags", default="", help="more flags of each training")
+    parser.add_argument("--episodes", type=int, help="a task (50; 5 where goals are hidden)")
     parser.add_argument("--at-once", type=int, default=2, help="runs at a time")
     parser.add_argument("--list", action="store_true", help="only say what is done")
     args = parser.parse_args(argv)
 
-    for variant in args.only:
-        choose(variant, VARIANTS, "variant")
+    plan = plan_of(args.suite)
+    variants = args.only or list(plan.variants)
+    for variant in variants:
+        choose(variant, plan.variants, "variant")
 
+    episodes = args.episodes or plan.episodes
     runs = [
-        jobs_of_run(variant, seed, suite=args.suite, steps=args.steps, episodes=args.episodes)
+        jobs_of_run(variant, seed, suite=args.suite, flags=args.flags, episodes=episodes)
         for seed in args.seeds
-        for variant in args.only
+        for variant in variants
     ]
     if args.list:
         for job in chain.from_iterable(runs):
