@@ -1228,6 +1228,49 @@ def test_check_reports_everything_and_moves_nothing(emulator, cell, capsys):
     assert all(frame[1] == 3 for frame in emulator.gripper_frames)  # reads only
 
 
+def test_one_check_of_poses_decides_wherever_they_come_from(
+    emulator, settings, cell, monkeypatch, capsys
+):
+    def refuse(self, poses):
+        raise RobotError("refused by the one check")
+
+    monkeypatch.setattr(Settings, "check_poses", refuse)
+    with pytest.raises(ValueError, match="the one check"):
+        replace(settings, start_pose=START_POSE)
+    with pytest.raises(RobotError, match="the one check"):
+        Moving(settings).__enter__()
+    start = np.array(START_POSE)
+    frame = robot.Frame(time=0.0, points=None, seen=0, state=np.append(start, 0.0))
+    with pytest.raises(RobotError, match="the one check"):  # a recorded episode
+        robot.finish([frame], [0.0], settings)
+    for motion in (lambda servo: servo.follow(STILL), lambda servo: servo.go(start)):
+        with simulated_arm(settings, start) as arm:
+            with pytest.raises(RobotError, match="the one check"):
+                motion(arm.servo)
+            assert arm.stopped
+    assert ends(["check", *cell]) == 2 and "the one check" in capsys.readouterr().err
+    assert emulator.received == []
+
+
+def test_one_check_of_states_decides_wherever_they_are_read(
+    emulator, settings, cell, monkeypatch, capsys
+):
+    def refuse(self):
+        raise RobotError("refused by the one check")
+
+    monkeypatch.setattr(robot.State, "check", refuse)
+    with pytest.raises(RobotError, match="the one check"):
+        Moving(settings).__enter__()
+    with simulated_arm(settings, np.array(START_POSE)) as arm:
+        with pytest.raises(RobotError, match="the one check"):
+            arm.servo.step()
+    Script(monkeypatch, "q")
+    for argv in (["check", *cell], record(cell, 1)):
+        assert ends(argv) == 2 and "the one check" in capsys.readouterr().err
+    assert emulator.received == []
+    assert all(frame[1] == 3 for frame in emulator.gripper_frames)  # reads only
+
+
 def test_check_needs_no_dashboard_which_polyscope_x_does_not_have(emulator, cell, capsys):
     emulator.faults.version = (10, 7, 0)
     with socket.create_server(("127.0.0.1", 0)) as server:
