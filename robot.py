@@ -220,6 +220,9 @@ def load_settings(path: str | Path) -> Settings:
     """Reads --config. UserError, one line: missing, unknown, of the wrong type, out of range."""
     try:
         return Settings(**json.loads(Path(path).read_text()))
+    except OSError as error:
+        reason = f"{path} cannot be read ({error.strerror})"
+        raise UserError(f"{reason}: name it by --config, or copy assets/robot.json") from None
     except (TypeError, ValueError) as error:
         reason = str(error).removeprefix("Settings.__init__() ")
         raise UserError(f"{path}: {reason} (an example is assets/robot.json)") from None
