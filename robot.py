@@ -6,12 +6,13 @@
     python robot.py run    --config robot.json --checkpoint adapted.pt --data demos/stack-cube.npz
     python robot.py camera --out scene.npz         # records depth images, for --camera
 
-All but the last with --host ADDRESS. Without an arm: `python -m tests.emulator`, and --host
-127.0.0.1. With --dry-run nothing is made to move.
+All but the last need --host ADDRESS, the robot's. Without an arm, `python -m tests.emulator`
+emulates one at 127.0.0.1. With --dry-run nothing is made to move.
 
 One action, from the network to the arm: `run` draws a chunk with `DAMIPolicy.sample_actions`,
-`Servo.follow` makes target poses of it, `Servo.tick` interpolates to 125 Hz and clamps, `RTDE.send`
-packs the bytes; on the controller `PROGRAM` reads the pose from registers and calls servoj.
+`Servo.follow` makes target poses of it, `Servo.tick` interpolates to 125 Hz and limits the speed,
+`RTDE.send` packs the bytes; on the controller `PROGRAM` reads the pose from registers and calls
+servoj.
 
 Poses are (x, y, z, rx, ry, rz): metres and axis-angle radians of the tool center point (TCP) in the
 robot's base frame. State (7,): TCP pose, gripper. Action (7,): dx, dy, dz in metres, drx, dry, drz
@@ -67,7 +68,10 @@ class CameraError(RobotError):
 
 
 class StaleState(RobotError):
-    """The newest state is too old. `arrived`: newer ones have, but this computer was too busy."""
+    """The newest state is too old.
+
+    `arrived`: newer ones have arrived, but this computer was too busy to read them.
+    """
 
     def __init__(self, message: str, arrived: bool) -> None:
         super().__init__(message)
@@ -88,17 +92,17 @@ class Settings:
 
     The first five have no default: they belong to the place where the arm stands. Raises
     ValueError, in one line, for a value of the wrong type, out of range, or at odds with another.
-    What an arm is to do is checked against them by `check_steps` and `check_poses`.
+    `check_steps` and `check_poses` tell whether the arm may do what it is to do.
     """
 
     tcp_low_m: tuple = setting(MISSING, "the box that the TCP stays in", **CORNER)
     tcp_high_m: tuple = setting(MISSING, "its upper corner", **CORNER)
     crop_low_m: tuple = setting(MISSING, "the box that points are kept in", **CORNER)
     crop_high_m: tuple = setting(MISSING, "its upper corner", **CORNER)
-    camera_to_base: tuple = setting(MISSING, "its DEPTH frame", **TRANSFORM)
+    camera_to_base: tuple = setting(MISSING, "pose of the DEPTH frame", **TRANSFORM)
     start_pose: tuple | None = setting(None, "where `run` begins", shape=(6,), least=-6.3, most=6.3)
     outside_box: str = setting("stop", "what to do with such targets", choices=("stop", "clamp"))
-    rotation_near_rad: tuple = setting((0, 3.14159, 0), "the nearer of two vectors", **CORNER)
+    rotation_near_rad: tuple = setting((0, 3.14159, 0), "the reference of `nearer`", **CORNER)
     num_points: int = setting(1024, "points of a cloud", least=1, most=100_000)
     policy_hz: float = setting(10.0, "observations and actions a second", least=1, most=30)
     servo_hz: float = setting(125.0, "poses a second", least=100, most=500)
@@ -107,14 +111,14 @@ class Settings:
     max_step_m: float = setting(0.05, "a longer step is a jump, and stops", least=0.001, most=0.5)
     max_step_rad: float = setting(0.2, "so is a larger turn", least=0.001, most=3.0)
     max_state_age_s: float = setting(0.1, "an older state stops", least=0.01, most=1.0)
-    max_lag_m: float = setting(0.03, "the arm may stay so far behind", least=0.001, most=0.5)
-    max_lag_rad: float = setting(0.2, "and turned so far", least=0.001, most=3.0)
-    max_hold_s: float = setting(2.0, "waits for a late policy or camera", least=0.01, most=60)
-    servo_lookahead_s: float = setting(0.1, "of servoj: smooths", least=0.03, most=0.2)
+    max_lag_m: float = setting(0.03, "a longer lag stops", least=0.001, most=0.5)
+    max_lag_rad: float = setting(0.2, "so does a larger angle", least=0.001, most=3.0)
+    max_hold_s: float = setting(2.0, "so long a late policy is waited for", least=0.01, most=60)
+    servo_lookahead_s: float = setting(0.1, "of servoj: smooths motion", least=0.03, most=0.2)
     servo_gain: float = setting(300.0, "of servoj", least=100, most=2000)
     gripper_serial: str | None = setting(None, "such as /dev/ttyUSB0; null: gripper_port of --host")
     gripper_slave: int = setting(1, "Modbus address", least=1, most=247)
-    gripper_open_at: int = setting(1000, "per mille that is open", choices=(0, 1000))
+    gripper_open_at: int = setting(1000, "per mille where it is open", choices=(0, 1000))
     gripper_force_percent: int = setting(30, "of its force", least=20, most=100)
     rtde_port: int = setting(30004, "RTDE", **PORT)
     script_port: int = setting(30002, "the secondary interface", **PORT)
@@ -132,7 +136,8 @@ class Settings:
             if not np.less(low, high).all():
                 self.refuse(f"{box}_low_m", f"each number must be below that of {box}_high_m")
         for unit in ("m", "rad"):
-            speed, allowed = getattr(self, f"max_speed_{unit}_s"), getattr(self, f"max_lag_{unit}")
+            speed = getattr(self, f"max_speed_{unit}_s")
+            allowed = getattr(self, f"max_lag_{unit}")
             lag = speed * self.servo_lookahead_s  # of a healthy arm at full speed
             if lag > 0.9 * allowed:
                 why = f"at max_speed_{unit}_s the arm lags by {lag:.3f}: allow more, or be slower"
@@ -147,7 +152,7 @@ class Settings:
         raise ValueError(f"{name} in the robot's settings is {getattr(self, name)!r}: {why}")
 
     def check_steps(self, steps: Sequence[np.ndarray]) -> None:
-        """Raises RobotError if one of the steps (6 or 7,) is too far for one of 1 / policy_hz."""
+        """Raises RobotError if a step (6 or 7,), which takes 1 / policy_hz seconds, is a jump."""
         for step in steps:
             metres, radians = lengths(step)
             if metres > self.max_step_m or radians > self.max_step_rad:
@@ -158,7 +163,8 @@ class Settings:
     def check_poses(self, poses: Sequence[np.ndarray]) -> None:
         """Raises RobotError if the arm must not go through these poses (6,).
 
-        They are 1 / policy_hz apart, and each must be finite and inside the TCP's box.
+        Each must be finite and inside the TCP's box. They are 1 / policy_hz seconds apart, and the
+        steps between them must not be jumps.
         """
         if not np.isfinite(poses).all():
             raise RobotError("a pose is not finite")
@@ -182,16 +188,16 @@ def check_value(
     rigid: bool = False,
     help: str = "",
 ) -> None:
-    """Raises ValueError, saying what to write, where a setting cannot have a value.
+    """Raises ValueError, saying what to write, if a setting cannot have this value.
 
     Args:
         value: a number or text, or lists of lists of them.
         kind: its type as the field of `Settings` has it: "int", "str | None", "tuple" ...
         shape: of the lists; () is a single value.
-        choices: the values that are possible; (): any.
+        choices: the values that are possible; () is any.
         least, most: the range of its numbers.
-        rigid: it is a matrix (4, 4) that moves a rigid body.
-        help: is not used; it belongs to the field, as the others do.
+        rigid: whether it is a matrix (4, 4) that moves a rigid body.
+        help: is not used; it is in the field's metadata, as those above are.
     """
     if value is None and kind.endswith("None"):
         return
@@ -311,8 +317,8 @@ class State(NamedTuple):
 class RTDE:
     """A client of the controller's RTDE interface, protocol version 2: one recipe each way.
 
-    A thread keeps the newest state. Nothing is connected again by itself: after a loss, make a new
-    one. A program that was made for this `session` follows what `send` writes, and no other does.
+    A thread keeps the newest state. A lost connection stays lost: make a new client. Only a program
+    that was made for this `session` follows what `send` writes.
     Raises RobotError: refused version, a field NOT_FOUND or IN_USE, lost connection or framing.
     """
 
@@ -358,6 +364,7 @@ class RTDE:
             raise self.lost("it does not start sending")
 
     def lost(self, what: str) -> RobotError:
+        """The error to raise: it names the controller, and ends with what that said last."""
         return RobotError(f"{self.name}: {what}{self.controller_said}")
 
     def recipe(self, reply: bytes, names: Sequence[str]) -> tuple[bytes, np.dtype]:
@@ -376,28 +383,36 @@ class RTDE:
         return reply[:1], np.dtype([(name, FORMATS[kind]) for name, kind in zip(names, types)])
 
     def package(self) -> tuple[int, bytes]:
-        """The next package's type and payload, however the bytes were split or joined."""
+        """The type and payload of the next package that is no text message; those are kept."""
         while True:
-            if len(self.buffer) >= HEADER.size:
-                size, kind = HEADER.unpack_from(self.buffer)
-                if size < HEADER.size:
-                    raise self.lost(f"framing lost (a package of {size} bytes)")
-                if len(self.buffer) >= size:
-                    payload = self.buffer[HEADER.size : size]
-                    self.buffer = self.buffer[size:]
-                    if kind != MESSAGE:
-                        return kind, payload
-                    text = payload[1 : 1 + payload[0]] if payload else b""
-                    message = text.decode("ascii", "replace")
-                    self.controller_said = f"; the controller said: {message}"
-                    continue
-            try:
-                received = self.socket.recv(65536)
-            except OSError as error:  # a time-out, too
-                raise self.lost(f"connection lost, or no answer: {error}") from None
-            if not received:
-                raise self.lost("connection closed by the controller")
-            self.buffer += received
+            kind, payload = self.any_package()
+            if kind != MESSAGE:
+                return kind, payload
+            text = payload[1 : 1 + payload[0]] if payload else b""
+            self.controller_said = f"; the controller said: {text.decode('ascii', 'replace')}"
+
+    def any_package(self) -> tuple[int, bytes]:
+        """The next package's type and payload, however the bytes were split or joined."""
+        while len(self.buffer) < HEADER.size:
+            self.receive()
+        size, kind = HEADER.unpack_from(self.buffer)
+        if size < HEADER.size:
+            raise self.lost(f"framing lost (a package of {size} bytes)")
+        while len(self.buffer) < size:
+            self.receive()
+        payload = self.buffer[HEADER.size : size]
+        self.buffer = self.buffer[size:]
+        return kind, payload
+
+    def receive(self) -> None:
+        """Appends to the buffer what arrives next."""
+        try:
+            received = self.socket.recv(65536)
+        except OSError as error:  # a time-out, too
+            raise self.lost(f"connection lost, or no answer: {error}") from None
+        if not received:
+            raise self.lost("connection closed by the controller")
+        self.buffer += received
 
     def request(self, kind: int, payload: bytes) -> bytes:
         """Sends a package and returns the payload of the answer, which has the same type."""
@@ -440,14 +455,19 @@ class RTDE:
             raise RobotError(str(self.error))
         age = time.monotonic() - self.newest.received if self.newest else math.inf
         if age > max_age:
-            with suppress(OSError, ValueError):  # closed meanwhile
-                arrived = bool(select.select([self.socket], [], [], 0)[0])
-                raise StaleState(str(self.lost(f"the newest state is {age:.3f} s old")), arrived)
-            raise self.lost("connection closed")
+            try:
+                readable, _, _ = select.select([self.socket], [], [], 0)
+            except (OSError, ValueError):  # closed meanwhile
+                raise self.lost("connection closed") from None
+            message = str(self.lost(f"the newest state is {age:.3f} s old"))
+            raise StaleState(message, arrived=bool(readable))
         return self.newest
 
     def send(self, pose: np.ndarray, stop: bool = False) -> None:
-        """Writes a target pose (6,) for the program, or tells it to end, the last thing sent."""
+        """Writes a target pose (6,) for the program; with `stop` tells it to end.
+
+        After a stop nothing is sent any more.
+        """
         with self.lock:
             if self.stopped:
                 return
@@ -475,13 +495,15 @@ class RTDE:
 
 # ---- The controller's program and its other ports ------------------------------------------------
 
-MISSING_PACKAGES = 10  # for which the watchdog waits: 80 ms at 125 Hz
+MISSING_PACKAGES = 10  # the watchdog waits for so many: 80 ms at 125 Hz
 
-# What runs on the controller. It ends when told to, when RTDE is late (the watchdog, so that no arm
-# moves or stays free whose computer is gone), or when no inverse kinematics is found. The session
-# says whose it is; the number of the package followed last says that it runs. A pose is six reads,
-# between which the next package may arrive: the numbers before and behind it are then different.
-# The watchdog rests before the arm is braked: nobody writes then, and it would cut that short.
+# What runs on the controller. It ends when it is told to, when no inverse kinematics is found, or
+# when RTDE is late: then the watchdog ends it, so that no arm moves or stays free whose computer is
+# gone. Output register 24 holds the session, which tells whose program it is, and 25 the number of
+# the package that it followed last, which tells that it runs. To read a pose takes six reads, and
+# the next package may arrive between them: then the package's two numbers, read before and after
+# the pose, are different, and the pose is not followed. The watchdog is switched off before the arm
+# is braked: nothing is sent then, and the watchdog would cut the braking short.
 PROGRAM = """def dami():
   rtde_set_watchdog("input_int_register_24", {watchdog_hz:.1f}, "stop")
   write_output_integer_register(25, 0)
@@ -526,7 +548,7 @@ def program(session: int, settings: Settings, free: bool) -> str:
 
 @contextmanager
 def port_of(host: str, port: int, what: str) -> Iterator[socket.socket]:
-    """A connection, whose errors are those of the robot."""
+    """A connection to a port of the controller; what fails inside is a RobotError."""
     try:
         with socket.create_connection((host, port), 2.0) as connection:
             yield connection
@@ -537,13 +559,14 @@ def port_of(host: str, port: int, what: str) -> Iterator[socket.socket]:
 def upload(host: str, port: int, text: str, waiting: Callable = lambda: None) -> None:
     """Sends a URScript program; the controller ends the one that runs and starts this one.
 
-    Until the port has answered, `waiting` is called again and again: the program may run already.
+    While the port has not answered, `waiting` is called again and again, to write the poses without
+    which the watchdog would end the program, which may run already.
     """
     with port_of(host, port, "the script port") as connection:
         connection.sendall(text.encode())
         deadline = time.monotonic() + 2
         received = 0  # bytes
-        while received < 79:  # one that closes without having read may have its program discarded
+        while received < 79:  # the program of a client that has read less may be discarded
             waiting()
             if not select.select([connection], [], [], 0.01)[0]:
                 if time.monotonic() > deadline:
@@ -628,7 +651,10 @@ class Gripper:
         self.close = self.port.close
 
     def exchange(self, function: int, register: int, value: int) -> int:
-        """Writes a register, or reads one (`value` 1: so many); the value in the answer."""
+        """Writes `value` to a register, or reads one; returns the value in the answer.
+
+        To read, `value` is how many registers are asked for: 1.
+        """
         request = struct.pack(">BBHH", self.settings.gripper_slave, function, register, value)
         request += crc16(request)
         for _ in range(self.RETRIES):
@@ -643,7 +669,7 @@ class Gripper:
                 continue
             if len(answer) < 5:
                 problem = "no answer"
-                time.sleep(self.timeout)  # a late one must not be taken for the next
+                time.sleep(self.timeout)  # a late answer must not be taken for the next one
             elif crc16(answer[:-2]) != answer[-2:]:
                 problem = "bad check sum"
             elif answer[1] == function | 0x80:
@@ -656,7 +682,7 @@ class Gripper:
         raise RobotError(f"the gripper at {self.where}: {problem}")
 
     def initialize(self, timeout: float = 10.0) -> None:
-        """Initializes it if that was not done yet (it opens and closes), and sets the force."""
+        """Initializes the gripper, which opens and closes, if it is not; then sets the force."""
         if self.exchange(READ, INITIALIZED, 1) != 1:
             self.exchange(WRITE, INITIALIZE, 1)
             deadline = time.monotonic() + timeout
@@ -695,8 +721,13 @@ def depth_to_points(depth: np.ndarray, intrinsics: Sequence[float]) -> np.ndarra
     return np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=-1).astype(np.float32)
 
 
-def to_base(depth: np.ndarray, intrinsics: Sequence[float], settings: Settings) -> list[np.ndarray]:
-    """Depth (H, W), metres -> points (M, 3) float32, base frame; those in the crop box."""
+def to_base(
+    depth: np.ndarray, intrinsics: Sequence[float], settings: Settings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W), metres -> points float32, base frame: all (M, 3), those in the crop box (K, 3).
+
+    Raises CameraError if there are none.
+    """
     points = depth_to_points(depth, intrinsics)
     if len(points) == 0:
         raise CameraError("the camera's depth is empty: check its cable, power and what it sees")
@@ -705,22 +736,24 @@ def to_base(depth: np.ndarray, intrinsics: Sequence[float], settings: Settings) 
     kept = ((points >= settings.crop_low_m) & (points <= settings.crop_high_m)).all(axis=1)
     if not kept.any():
         raise CameraError("no point lies in the crop box: check camera_to_base and crop_low_m")
-    return [points, points[kept]]
+    return points, points[kept]
 
 
 SAMPLED_FROM = 8192  # points at most: 10 ms
 
 
-def cloud(depth: np.ndarray, intrinsics: Sequence[float], settings: Settings) -> tuple:
-    """Depth (H, W), metres -> the policy's points (N, 3) float32, base frame; from how many (int).
+def cloud(
+    depth: np.ndarray, intrinsics: Sequence[float], settings: Settings
+) -> tuple[np.ndarray, int]:
+    """Depth (H, W), metres -> the policy's points (N, 3) float32, base frame; from how many.
 
-    They are cropped and farthest point sampled. Fewer than N are repeated; of many, every second,
-    third ... is sampled from: sampling keeps Python's lock, in which no other thread runs, and
-    300 000 points would hold up the servo stream for a quarter of a second.
+    The points in the crop box are farthest point sampled. Fewer than N are repeated. Of more than
+    SAMPLED_FROM only every second, third ... is kept before: sampling holds Python's lock, so that
+    no other thread runs, and 300 000 points would delay the servo stream by a quarter of a second.
     """
     _, points = to_base(depth, intrinsics, settings)
-    some = points[:: math.ceil(len(points) / SAMPLED_FROM)]
-    return data.farthest_point_sample(some, settings.num_points), len(points)
+    thinned = points[:: math.ceil(len(points) / SAMPLED_FROM)]
+    return data.farthest_point_sample(thinned, settings.num_points), len(points)
 
 
 class RealSense:
@@ -747,8 +780,9 @@ class RealSense:
         deadline = time.monotonic() + 1.0
         try:
             while time.monotonic() < deadline:
-                there, found = self.pipeline.try_wait_for_frames(30)  # in it Ctrl-C is not heard
-                if there and (frame := found.get_depth_frame()):
+                arrived, frames = self.pipeline.try_wait_for_frames(30)  # ms: Ctrl-C must wait
+                frame = frames.get_depth_frame() if arrived else None
+                if frame:
                     return np.asarray(frame.get_data()).astype(np.float32) * self.unit
         except RuntimeError as error:
             raise CameraError(f"the RealSense camera: {error}") from None
@@ -756,7 +790,7 @@ class RealSense:
 
 
 def realsense_intrinsics(stream: Any) -> tuple[float, ...]:
-    """Of a pyrealsense2 stream profile."""
+    """Focal lengths and principal point, in pixels, of a pyrealsense2 stream profile."""
     i = stream.as_video_stream_profile().get_intrinsics()
     return i.fx, i.fy, i.ppx, i.ppy
 
