@@ -827,7 +827,7 @@ WRITING = "writing the recording"
 
 
 class Activity:
-    """What the main thread is at, and was: what to blame when the servo's thread runs late."""
+    """What the main thread does and did lately: what to blame if the servo's thread runs late."""
 
     def __init__(self) -> None:
         self.current: tuple[str, float] | None = None  # name, began
@@ -835,7 +835,7 @@ class Activity:
 
     @contextmanager
     def during(self, name: str) -> Iterator[None]:
-        """Inside, the main thread is at this."""
+        """Inside, the main thread does this."""
         began = time.monotonic()
         self.current = (name, began)
         try:
@@ -845,13 +845,17 @@ class Activity:
             self.current = None
 
     def longest(self, since: float, now: float) -> tuple[str, float]:
-        """What took longest between two times, and how many seconds of them."""
-        took = {"waiting": 0.0}
-        current = self.current
-        running = [(*current, now)] if current else []
-        for name, began, ended in [*self.ended, *running]:
-            took[name] = took.get(name, 0.0) + max(0.0, min(ended, now) - max(began, since))
-        return max(took.items(), key=lambda item: item[1])
+        """What the main thread did longest between two times, and for how many seconds of them."""
+        intervals = list(self.ended)
+        current = self.current  # read once: the main thread changes it meanwhile
+        if current is not None:
+            name, began = current
+            intervals.append((name, began, now))
+        seconds = {"waiting": 0.0}
+        for name, began, ended in intervals:
+            overlap = min(ended, now) - max(began, since)
+            seconds[name] = seconds.get(name, 0.0) + max(0.0, overlap)
+        return max(seconds.items(), key=lambda item: item[1])
 
 
 # ---- Streaming motion ----------------------------------------------------------------------------
@@ -866,10 +870,10 @@ def quaternion(rotvec: Sequence[float]) -> tuple[float, float, float, float]:
 
 
 def rotate(rotvec: Sequence[float], turn: Sequence[float]) -> np.ndarray:
-    """The rotation vector (3,) of one rotation, then another; its angle is at most pi.
+    """The rotation vector (3,) of one rotation, then a further turn; its angle is at most pi.
 
-    Plain numbers, and not an array library: the servo's thread does this ten times in 8 ms, and it
-    takes five microseconds, in which it keeps Python's lock from all others.
+    In plain numbers, which take a tenth of the time that arrays of three numbers take: the servo's
+    thread does this ten times in 8 ms, and keeps Python's lock from all other threads meanwhile.
     """
     aw, ax, ay, az = quaternion(turn)
     bw, bx, by, bz = quaternion(rotvec)
@@ -922,7 +926,8 @@ def distance(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
 def toward(pose: np.ndarray, target: np.ndarray, most: np.ndarray) -> np.ndarray:
     """From pose to target (6,), by no more than (metres, radians): straight, and on SO(3)."""
     step = difference(pose, target)
-    return compose(pose, step * np.repeat(np.minimum(1, most / lengths(step).clip(1e-12)), 3))
+    shares = np.minimum(1, most / lengths(step).clip(1e-12))  # (2,) of the way, of the turn
+    return compose(pose, step * np.repeat(shares, 3))
 
 
 def warn(text: str) -> None:
@@ -936,8 +941,9 @@ class Servo:
     holds the last target when all are reached. With `free` it only keeps the arm free to be moved
     by hand. It stops for good, and says why, when
 
-    - the newest state is older than `max_state_age_s`, or that much later than the promptest, the
-      connection or its framing is lost, or the controller's clock stands still or runs backwards;
+    - the newest state is older than `max_state_age_s`, or arrives later by that than the promptest
+      one did; the connection or its framing is lost; the controller's clock stands still or runs
+      backwards;
     - the robot is not running, its safety mode is neither normal nor reduced, its speed slider is
       not at 100 %, or our program is paused, has ended, or has been replaced by another;
     - the arm is farther than `max_lag_m` or `max_lag_rad` from where it should be;
@@ -945,15 +951,17 @@ class Servo:
     - an action has the wrong shape, NaN, or a jump; no new ones come for `max_hold_s`.
 
     To stop is to tell the program on the controller to end, once; nothing is sent after that.
+
     An arm that follows `servoj` is behind by about its lookahead time. So no pose is sent that is
-    farther ahead of the measured one than the arm may go in that time: held back and let go, it is
-    not faster than allowed. The targets move a little slower, for the delay of what is measured.
+    farther ahead of the measured one than the arm may go in that time: then an arm that was held
+    back, and is let go, is not faster than allowed. As the measured pose is old by `DELAY`, targets
+    move a little slower than the arm may.
     """
 
     DELAY = 0.025  # seconds from measuring a pose to following the answer
     PATIENCE = 5.0  # seconds for the program to start
-    REACHED = 1e-6  # metres and radians from the target: nothing is left to go
-    STANDS = 1e-7  # metres and radians of a step: the slowest arm allowed goes ten times as far
+    REACHED = 1e-6  # metres and radians: a target that is nearer has been reached
+    STANDS = 1e-7  # metres and radians: a step of the slowest arm allowed is ten times as long
     SLOW = "the policy or the camera is too slow"
 
     def __init__(
@@ -971,24 +979,24 @@ class Servo:
         self.activity = activity or Activity()
 
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
-        self.sent = self.pose  # sent last: not farther ahead of the arm than `lead`
+        self.sent = self.pose  # sent last: ahead of the measured pose by no more than `lead`
         fastest = np.array([settings.max_speed_m_s, settings.max_speed_rad_s])
         lookahead = settings.servo_lookahead_s
         self.lead = fastest * lookahead  # (2,) metres, radians
         self.speed = self.lead / (lookahead + self.DELAY)  # (2,) a second, of the targets
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
-        self.broken_off = False  # targets were left out
+        self.broken_off = False  # targets were left out, by `hold`
         self.held_since = time.monotonic()
         self.missing = self.SLOW  # why the arm holds
 
         self.lock = threading.Lock()  # of the targets
         self.error: str | None = None  # why the arm was stopped
         self.ended = threading.Event()
-        self.changed: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
-        self.delay = math.inf  # of the promptest state, and a constant
-        self.last_step = (time.monotonic(), time.process_time())  # when, and computed until then
+        self.counters: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
+        self.delay = math.inf  # of the promptest state; like all delays, plus a constant
+        self.last_step = (time.monotonic(), time.process_time())  # of the stream
         self.stall = ""  # why the stream stood still for so long that the watchdog may have struck
-        self.stalled_at = -math.inf
+        self.stalled_at = -math.inf  # when that was noticed
 
         self.lateness: list[float] = []  # seconds, of each package
         self.ages: list[float] = []  # seconds, of the state that each package answers
@@ -1005,19 +1013,11 @@ class Servo:
             state = self.rtde.state(settings.max_state_age_s)
             self.pose = state.pose  # not an older one: the arm may have been moved meanwhile
             try:
-                state.check()
-                if not self.free:
-                    settings.check_poses([self.pose])
-                if time.monotonic() > deadline:
-                    raise RobotError(
-                        f"its program does not start: remote control?{self.rtde.controller_said}"
-                    )
-                if not self.moves or self.rtde.program_runs(state):
-                    break
-                if not uploaded and state.values["robot_status_bits"] & PROGRAM_RUNNING:
-                    raise RobotError("another program runs there, stop it first")
+                self.check_start(state, deadline, uploaded)
             except RobotError as error:
                 raise RobotError(f"the arm is not moved: {error}") from None
+            if not self.moves or self.rtde.program_runs(state):
+                break
             self.send(self.pose)
             if not uploaded:
                 text = program(self.rtde.session, settings, self.free)
@@ -1027,6 +1027,18 @@ class Servo:
         self.held_since = time.monotonic()
         self.last_step = (self.held_since, time.process_time())
         self.thread.start()
+
+    def check_start(self, state: State, deadline: float, uploaded: bool) -> None:
+        """Raises RobotError if the program must not be started in this state, or does not start."""
+        state.check()
+        if not self.free:
+            self.settings.check_poses([state.pose])
+        if time.monotonic() > deadline:
+            raise RobotError(
+                f"its program does not start: remote control?{self.rtde.controller_said}"
+            )
+        if self.moves and not uploaded and state.values["robot_status_bits"] & PROGRAM_RUNNING:
+            raise RobotError("another program runs there, stop it first")
 
     def send(self, pose: np.ndarray) -> None:
         self.sent = pose
@@ -1040,19 +1052,19 @@ class Servo:
                 raise RobotError(f"actions have the shape {actions.shape}, not (n, {ACTION_DIM})")
             if not np.isfinite(actions).all():
                 raise RobotError("an action is not finite")
-            self.settings.check_steps(actions)  # as asked: clamped to the box, none may be a jump
+            self.settings.check_steps(actions)  # before a jump is cut short by the box
             poses = [self.pose]
             for action in actions:
                 poses.append(self.into_box(compose(poses[-1], action)))
             self.settings.check_poses(poses)
-            when = time.monotonic() + np.arange(1, len(poses)) / self.settings.policy_hz
-            self.targets = list(zip(when, poses[1:]))
+            times = time.monotonic() + np.arange(1, len(poses)) / self.settings.policy_hz
+            self.targets = list(zip(times, poses[1:]))
             self.broken_off = False
         self.slowed += self.too_fast(actions)
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
-        """Inside, an error stops the arm before it is raised; if it was stopped, that is raised."""
+        """Inside, an error stops the arm, and is raised; so is that of an arm stopped before."""
         self.check()
         try:
             yield
@@ -1061,21 +1073,21 @@ class Servo:
         self.check()
 
     def hold(self) -> None:
-        """Leaves out the targets that are left: what comes next follows from where the arm is."""
+        """Holds the arm where it is now: the targets that it has not reached are left out."""
         with self.lock:
             self.broken_off = self.broken_off or bool(self.targets)
             self.targets = []
 
     def too_fast(self, actions: np.ndarray) -> int:
-        """How many actions (n, 7) ask for more than the speed allowed: they are cut short."""
+        """How many of the actions (n, 7) are faster than the arm may go: they are cut short."""
         return int((lengths(actions) * self.settings.policy_hz > self.speed).any(axis=1).sum())
 
     def go(self, pose: np.ndarray) -> None:
         """Goes straight to a pose (6,) at a quarter of the speed allowed; returns when there.
 
-        The line is divided into targets that are 0.1 s apart, whatever `policy_hz` and `max_step_m`
-        say of a policy's steps. The last of them is repeated until an arm that lags by servoj's
-        lookahead time has arrived, too. The box is convex: with both ends the line lies in it.
+        The line is divided into targets that are 0.1 s apart; `policy_hz` and `max_step_m` are for
+        a policy's steps alone. The last target is repeated, until the arm, which lags by servoj's
+        lookahead time, has arrived, too. The box is convex: with both ends the line lies in it.
         """
         with self.stopping(), self.lock:
             start = self.pose
@@ -1089,12 +1101,12 @@ class Servo:
             self.targets = [
                 (now + seconds * i / n, compose(start, step * i / n)) for i in range(1, n + 1)
             ]
-            arrived = now + seconds + 3 * self.settings.servo_lookahead_s
-            self.targets.append((arrived, self.targets[-1][1]))
+            arrival = now + seconds + 3 * self.settings.servo_lookahead_s
+            self.targets.append((arrival, self.targets[-1][1]))
             self.broken_off = False
         while self.targets:
             with self.stopping():
-                if time.monotonic() > arrived + 1.0:
+                if time.monotonic() > arrival + 1.0:
                     raise RobotError("the pose that the arm was sent to is not reached")
             time.sleep(0.01)
         self.check()
@@ -1115,14 +1127,14 @@ class Servo:
                 self.targets.pop(0)
             if self.targets:
                 when, target = self.targets[0]
-                share = min(1.0, dt / max(when - now + dt, dt))
-                goal = compose(self.pose, share * difference(self.pose, target))
+                share = min(1.0, dt / max(when - now + dt, dt))  # of what is left, in this tick
                 before = self.pose
+                goal = compose(before, share * difference(before, target))
                 self.pose = toward(before, goal, self.speed * dt)
                 if when <= now and distance(self.pose, target).max() < self.REACHED:
                     self.targets = []
                 if when > now or distance(self.pose, before).max() > self.STANDS:
-                    self.held_since = now  # an overdue target, too, while the arm comes nearer
+                    self.held_since = now  # on its way: overdue perhaps, but coming nearer
             return self.pose
 
     def stream(self) -> None:
@@ -1166,9 +1178,9 @@ class Servo:
     def describe_stall(self) -> str:
         """With what this computer was busy since the last step of the stream.
 
-        A thread of this program that computes in a library may keep Python's lock, so that no other
-        thread runs; then the program has used a processor meanwhile. If it has not, it waited for
-        the disk, or other programs had the processors.
+        If this program has computed most of the time, a thread of it has kept Python's lock, in a
+        library perhaps, so that no other thread ran. If it has not, it waited for the disk, or
+        other programs had the processors.
         """
         before, computed_before = self.last_step
         now = time.monotonic()
@@ -1205,10 +1217,7 @@ class Servo:
         """Raises RobotError if controller or program do not go on, or states come later."""
         max_age = self.settings.max_state_age_s
         values = state.values
-        delay = now - values["timestamp"]  # and a constant
-        # Clocks may drift apart by a thousandth.
-        self.delay = min(self.delay + 1e-3 / self.settings.servo_hz, delay)
-        watched = {"the controller's clock": values["timestamp"]}
+        counters = {"the controller's clock": values["timestamp"]}
         if self.moves:
             if not self.rtde.program_runs(state):
                 stall = self.stall if now - self.stalled_at < 1 else ""  # the watchdog ended it
@@ -1216,16 +1225,21 @@ class Servo:
                     "the program on the controller has ended, or is paused"
                     f"{self.rtde.controller_said}{stall}"
                 )
-            watched["our program"] = values["output_int_register_25"]
-        for name, value in watched.items():
-            old, since = self.changed.get(name, (value, now))
+            counters["our program"] = values["output_int_register_25"]
+        for name, value in counters.items():
+            old, since = self.counters.get(name, (value, now))
             if value < old:
                 raise RobotError(f"{name} runs backwards")
             if now - since > 2 * max_age:
                 raise RobotError(f"{name} stands still")
-            self.changed[name] = (value, now if value > old else since)
-        ticks = self.changed["the controller's clock"][1] == now
-        if ticks and delay - self.delay > max_age:
+            self.counters[name] = (value, now if value > old else since)
+
+        delay = now - values["timestamp"]  # plus a constant: the clocks began at different times
+        drift = 1e-3 / self.settings.servo_hz  # clocks may drift apart by a thousandth
+        self.delay = min(self.delay + drift, delay)
+        _, since = self.counters["the controller's clock"]
+        state_is_new = since == now
+        if state_is_new and delay - self.delay > max_age:
             raise RobotError(f"states arrive {delay - self.delay:.3f} s later than at first")
 
     def check(self) -> None:
@@ -1238,10 +1252,10 @@ class Servo:
         self.error = self.error or reason
         with suppress(RobotError):  # a lost connection: the watchdog on the controller stops it
             if self.moves:
-                self.rtde.send(self.sent, stop=True)  # nothing new to follow
+                self.rtde.send(self.sent, stop=True)  # with the old pose: no new one is followed
 
     def stop(self) -> None:
-        """Ends the stream and the program on the controller, and says if that goes on."""
+        """Ends the stream and the program on the controller, and warns if a program goes on."""
         self.ended.set()
         self.fail("stopped")
         age = self.settings.max_state_age_s
@@ -1249,11 +1263,12 @@ class Servo:
         with suppress(RobotError):  # a lost connection says nothing about the program
             while self.moves and self.rtde.program_runs(self.rtde.state(age)):
                 if time.monotonic() > deadline:
-                    return warn("a program on the controller does not end: stop it by hand")
+                    warn("a program on the controller does not end: stop it by hand")
+                    break
                 time.sleep(0.01)
 
     def report(self) -> str:
-        """How regular the stream was, and a warning for what was not done as asked."""
+        """Says how regular the stream was, and warns of what was not done as asked."""
         if self.clamped:
             warn(f"{self.clamped} targets lay outside the box and were clamped")
         if self.slowed:
