@@ -1309,9 +1309,10 @@ class Cell:
     activity: Activity
 
     def observe(self, servo: Servo | None = None) -> Frame:
-        """The present observation; while there is none `servo` holds the arm, until it stops it.
+        """The present observation.
 
-        What was left to do is left out: the arm goes nowhere that is not seen.
+        While the camera gives none, `servo` holds the arm, which goes nowhere that is not seen, and
+        stops it after `max_hold_s`. Without a servo that is a CameraError at once.
         """
         while True:
             try:
@@ -1337,7 +1338,10 @@ class Cell:
         return Frame(time.monotonic(), points, seen, state)
 
     def prepare(self, moves: bool) -> None:
-        """Camera, gripper and arm must answer before anything moves; then readies the gripper."""
+        """Raises RobotError if camera, gripper or arm are not ready; then initializes the gripper.
+
+        Nothing moves before all three have answered; without `moves` nothing moves at all.
+        """
         self.observe()
         try:
             self.rtde.state(self.settings.max_state_age_s).check()
@@ -1347,7 +1351,10 @@ class Cell:
             self.gripper.initialize()
 
     def made_with(self, recording: Demonstrations | None = None) -> dict:
-        """What recordings tell of the robot. UserError for one that was made with another."""
+        """What a recording's `meta` tells of the robot.
+
+        Raises UserError if `recording` was made with a robot of other settings.
+        """
         settings = self.settings
         values = self.rtde.state(settings.max_state_age_s).values
         now = {
@@ -1358,16 +1365,21 @@ class Cell:
             "gripper_open_at": settings.gripper_open_at,
             "workspace": boxes(settings)["workspace"],
         }
-        for name, value in now.items():
-            recorded = recording.meta.get(name) if recording else value
-            if name == "tcp_offset" and same_tcp(recorded, value):
-                continue
-            if recorded != value:
-                raise UserError(
-                    f"{recording.task} was recorded with {name} {recorded}, now it is {value}: "
-                    "set it as it was, or record again"
-                )
+        if recording is not None:
+            check_same_robot(recording, now)
         return {**now, **boxes(settings), "positions_in_state": 1}
+
+
+def check_same_robot(recording: Demonstrations, now: dict) -> None:
+    """Raises UserError for a value that the recording's `meta` has otherwise than it is now."""
+    for name, value in now.items():
+        recorded = recording.meta.get(name)
+        same = same_tcp(recorded, value) if name == "tcp_offset" else recorded == value
+        if not same:
+            raise UserError(
+                f"{recording.task} was recorded with {name} {recorded}, now it is {value}: "
+                "set it as it was, or record again"
+            )
 
 
 def same_tcp(recorded: Any, offset: list[float]) -> bool:
@@ -1380,7 +1392,10 @@ def same_tcp(recorded: Any, offset: list[float]) -> bool:
 
 
 def boxes(settings: Settings) -> dict:
-    """Two corners each: the box of the points, about whose middle augmentation turns, the TCP's."""
+    """The two boxes as recordings name them, two corners each.
+
+    `workspace` is that of the points: augmentation turns scenes about its middle.
+    """
     return {
         "workspace": [list(settings.crop_low_m), list(settings.crop_high_m)],
         "tcp_box": [list(settings.tcp_low_m), list(settings.tcp_high_m)],
@@ -1443,7 +1458,7 @@ def to_recording(
 
 
 def save(out: Path, recording: Demonstrations) -> Demonstrations:
-    """Writes a recording, and names the path where the disk is full."""
+    """Writes a recording and returns it; UserError names the path where the disk is full."""
     try:
         data.save_demonstrations(out, recording)
     except OSError as error:
@@ -1455,7 +1470,7 @@ def save(out: Path, recording: Demonstrations) -> Demonstrations:
 
 
 def run(args: argparse.Namespace, settings: Settings) -> None:
-    """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and again."""
+    """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and so on."""
     common.pick_device(args.device)
     policy, info = model.load(args.checkpoint, args.device, needs=("text_weights",))
     config = policy.config
@@ -1481,7 +1496,8 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
         context = policy.encode_demo(text.to(args.device), **demo)
 
     def act(frames: list[Frame]) -> np.ndarray | None:
-        if not frames[-1].time - frames[0].time < args.seconds:  # NaN seconds, too
+        seconds = frames[-1].time - frames[0].time
+        if not seconds < args.seconds:  # in this form NaN ends it at once, too
             return None
         padded = [frames[0]] * config.n_obs_steps + frames
         observed = padded[-config.n_obs_steps :]  # To frames
@@ -1515,7 +1531,7 @@ def replay(args: argparse.Namespace, settings: Settings) -> None:
 
 @dataclass
 class Log:
-    """What was seen and done, as it is written when it ends."""
+    """What was seen and done since the start; `drive` writes it in the end."""
 
     frames: list[Frame] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)  # (7,)
@@ -1549,10 +1565,11 @@ def drive(
     act: Callable[[list[Frame]], np.ndarray | None],
     start: Sequence[float] | None,
 ) -> None:
-    """Executes the chunks (Ta, 7) with which `act` answers all frames seen, until it says None.
+    """Executes the chunks (Ta, 7) that `act` makes of all frames seen, until it returns None.
 
-    If camera or gripper are late, or fail, what is left of a chunk is left out. Frames and actions
-    are written to a file in the format of recordings, however it ends, but by a second Ctrl-C.
+    If camera or gripper are late, or fail, the rest of a chunk is left out. However this ends,
+    frames and actions are written to a file in the format of recordings; only a second Ctrl-C may
+    prevent that.
     """
     name = f"{recording.task}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.npz"
     out = Path(args.out or f"runs/robot/{name}")
@@ -1587,7 +1604,7 @@ def drive(
 
 
 def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
-    """Executes the actions (Ta, 7) of a chunk, and logs them and what is seen after each."""
+    """Executes the actions (Ta, 7) of a chunk; logs them, and what is seen after each."""
     period = 1 / servo.settings.policy_hz
     servo.follow(chunk)
     began = time.monotonic()
@@ -1606,7 +1623,7 @@ def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
         log.frames.append(cell.observe(servo))
         late = time.monotonic() - due
         if step < len(chunk) and late > period:
-            servo.hold()  # the gripper must act where the arm was to be then
+            servo.hold()  # the arm has gone on, so the gripper's next action is late for its place
         if servo.broken_off:
             return
 
@@ -1615,10 +1632,9 @@ def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
 
 
 class Keys:
-    """The keys pressed so far, one at a time, without waiting.
+    """The keys pressed so far, one at a time, without waiting; where from: see `record`.
 
-    They are those of the terminal, where no Enter is needed. Where standard input is no terminal,
-    they are what a script, or the driver of a foot pedal, writes into it; its end means `q`.
+    In a terminal no Enter is needed.
     """
 
     def __enter__(self) -> Keys:
@@ -1640,7 +1656,7 @@ class Keys:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self.attributes)
 
     def pressed(self) -> str:
-        """One key, or an empty string. Raises RobotError where the terminal is gone."""
+        """One key, or an empty string if none was pressed. RobotError: the terminal is gone."""
         while select.select([sys.stdin], [], [], 0)[0]:
             key = os.read(sys.stdin.fileno(), 1).decode("ascii", "replace")  # unbuffered
             if key == "" and self.terminal:
@@ -1652,8 +1668,8 @@ class Keys:
         return ""
 
 
-def finish(frames: list[Frame], grip: list[float], settings: Settings) -> np.ndarray:
-    """Frames (T) and the gripper's commands (T) -> actions (T, 7), each leads to the next frame.
+def episode_actions(frames: list[Frame], grip: list[float], settings: Settings) -> np.ndarray:
+    """Frames (T) and the gripper's commands (T) -> actions (T, 7); each leads to the next frame.
 
     Raises RobotError for an episode that `run` could not execute.
     """
@@ -1661,8 +1677,9 @@ def finish(frames: list[Frame], grip: list[float], settings: Settings) -> np.nda
     settings.check_poses(poses)
     times = [frame.time for frame in frames]
     gaps = np.diff(times) if len(times) > 1 else np.zeros(1)  # seconds
+    # An action takes 1 / policy_hz seconds: `replay` would be faster than the hand was.
     if gaps.max() > 2 / settings.policy_hz or gaps.mean() > 1.2 / settings.policy_hz:
-        raise RobotError(  # replay would be faster
+        raise RobotError(
             f"frames are {gaps.mean():.2f}, up to {gaps.max():.2f} s apart, camera or gripper were "
             "late"
         )
@@ -1672,7 +1689,7 @@ def finish(frames: list[Frame], grip: list[float], settings: Settings) -> np.nda
 
 @dataclass
 class Recorder:
-    """The episode at hand, and those that are kept."""
+    """The episode that is being recorded, and those that are kept."""
 
     args: argparse.Namespace
     cell: Cell
@@ -1680,8 +1697,8 @@ class Recorder:
     meta: dict
     kept: Demonstrations | None  # all episodes of the file
     count: int = 0  # episodes kept since the start
-    closed: float = 0.0  # what the gripper was told: 1 closed
-    frames: list[Frame] | None = None  # of the episode at hand; None: there is none
+    closed: float = 0.0  # the gripper's command: 0 open, 1 closed
+    frames: list[Frame] | None = None  # of the episode that is being recorded; None: there is none
     grip: list[float] = field(default_factory=list)  # the gripper's command at each frame
 
     def press(self, key: str, servo: Servo) -> None:
@@ -1703,15 +1720,15 @@ class Recorder:
             self.frames = None
 
     def observe(self) -> None:
-        """Adds what is seen now to the episode at hand."""
+        """Adds what is seen now to the episode that is being recorded."""
         if self.frames is not None:
             self.frames.append(self.cell.observe())
             self.grip.append(self.closed)
 
     def keep(self, servo: Servo) -> None:
-        """Writes the episode at hand behind the others, if `run` could execute it."""
+        """Writes the recorded episode behind the others, if `run` could execute it."""
         try:
-            actions = finish(self.frames, self.grip, self.cell.settings)
+            actions = episode_actions(self.frames, self.grip, self.cell.settings)
         except RobotError as error:
             print(f"dropped: {error}", flush=True)
             return
@@ -1787,11 +1804,11 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
 
 
 def check(args: argparse.Namespace, settings: Settings) -> None:
-    """Connects to everything, moves nothing, and says what it found."""
+    """Connects to everything, moves nothing, and says what is there."""
     asked = ("robotmode", "safetystatus", "programState", "is in remote control")
     try:
         answers = dashboard(args.host, settings.dashboard_port, *asked)
-    except RobotError as error:  # nothing but `check` needs it
+    except RobotError as error:  # the other commands do without it
         answers = {
             "dashboard": f"none ({error}): PolyScope X has none, elsewhere enable it",
             "is in remote control": "unknown: look at the panel",
@@ -1826,19 +1843,24 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
     for name, value in rows.items():
         print(f"{name:22}{value}")
     if args.picture:
-        sampled = points[:: math.ceil(len(points) / SAMPLED_FROM)]
-        frame = Frame(0.0, sampled, len(kept), np.append(state.pose, 0.0))
-        seen = to_recording(
-            [frame],
-            np.zeros((1, ACTION_DIM)),
-            task="check",
-            instruction="the robot's base frame",
-            meta={**meta, "positions_in_state": 1},
-        )
-        report.plot_demonstration(seen, args.picture)
+        thinned = points[:: math.ceil(len(points) / SAMPLED_FROM)]
+        frame = Frame(time=0.0, points=thinned, seen=len(kept), state=np.append(state.pose, 0.0))
+        plot_cell(args.picture, frame, meta)
         print(f"wrote {args.picture}")
     if trouble:
         raise RobotError(f"the arm cannot be moved: {trouble}")
+
+
+def plot_cell(path: str, frame: Frame, meta: dict) -> None:
+    """Draws a frame's points and TCP, and the boxes that `meta` names."""
+    recording = to_recording(
+        [frame],
+        np.zeros((1, ACTION_DIM)),
+        task="check",
+        instruction="the robot's base frame",
+        meta=meta,
+    )
+    report.plot_demonstration(recording, path)
 
 
 def record_camera(args: argparse.Namespace) -> None:
@@ -1866,36 +1888,48 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         description="Record, check and run on a UR10e. Keep a hand on the emergency stop."
     )
     commands = parser.add_subparsers(dest="command", required=True)
+    add = {}  # command -> the function that adds a flag to it
     for name, function in COMMANDS.items():
         text = function.__doc__
-        add = commands.add_parser(name, help=text.split("\n")[0], description=text).add_argument
-        add("--camera", metavar="FILE", help="replay a recorded camera instead of the RealSense")
-        if name == "camera":
-            add("--out", required=True, help="file to write, .npz")
-            add("--frames", type=int, default=30, help="how many images (default: 30)")
-            continue
-        add("--host", required=True, help="address of the robot; nothing else is contacted")
-        add("--config", default="robot.json", help="poses, boxes, limits (default: robot.json)")
-        if name == "check":
-            add("--picture", metavar="PNG", help="draw cloud, crop box and the TCP's box")
-            continue
-        add("--dry-run", action="store_true", help="everything but motion")
-        add("--out", help="file to write (default: demos/TASK.npz, runs/robot/TASK-TIME.npz)")
-        if name == "record":
-            add("--task", required=True, help="name of the task, and of the file")
-            add("--instruction", required=True, help="what to do, one sentence")
-            add("--episodes", type=int, default=10, help="how many to record (default: 10)")
-            add("--append", action="store_true", help="go on with a file that exists")
-            continue
-        add("--data", required=True, help="the task's demonstrations")
-        if name == "replay":
-            add("--episode", type=int, default=0, help="which, from 0 (default: 0)")
-            continue
-        add("--checkpoint", required=True, help="adapted policy of finetune.py")
-        add("--seconds", type=float, default=60, help="how long (default: 60)")
-        add("--seed", type=int, default=0, help="of noise and reference demonstration (default: 0)")
-        add("--device", default="cpu", help="where the policy computes: cpu, cuda (default: cpu)")
-        add("--clip-weights", help="ViT-B-32.pt, or `random` (default: as in the checkpoint)")
+        command = commands.add_parser(name, help=text.split("\n")[0], description=text)
+        add[name] = command.add_argument
+        add[name](
+            "--camera", metavar="FILE", help="replay a recorded camera instead of the RealSense"
+        )
+    for name in ("check", "record", "replay", "run"):
+        add[name]("--host", required=True, help="address of the robot; nothing else is contacted")
+        add[name](
+            "--config", default="robot.json", help="poses, boxes, limits (default: robot.json)"
+        )
+    for name in ("record", "replay", "run"):
+        add[name]("--dry-run", action="store_true", help="everything but motion")
+    for name in ("replay", "run"):
+        add[name]("--data", required=True, help="the task's demonstrations")
+        add[name]("--out", help="file to write (default: runs/robot/TASK-TIME-PROCESS.npz)")
+
+    flag = add["check"]
+    flag("--picture", metavar="PNG", help="draw cloud, crop box and the TCP's box")
+
+    flag = add["record"]
+    flag("--task", required=True, help="name of the task, and of the file")
+    flag("--instruction", required=True, help="what to do, one sentence")
+    flag("--episodes", type=int, default=10, help="how many to record (default: 10)")
+    flag("--append", action="store_true", help="go on with a file that exists")
+    flag("--out", help="file to write (default: demos/TASK.npz)")
+
+    flag = add["replay"]
+    flag("--episode", type=int, default=0, help="which, from 0 (default: 0)")
+
+    flag = add["run"]
+    flag("--checkpoint", required=True, help="adapted policy of finetune.py")
+    flag("--seconds", type=float, default=60, help="how long (default: 60)")
+    flag("--seed", type=int, default=0, help="of noise and reference demonstration (default: 0)")
+    flag("--device", default="cpu", help="where the policy computes: cpu, cuda (default: cpu)")
+    flag("--clip-weights", help="ViT-B-32.pt, or `random` (default: as in the checkpoint)")
+
+    flag = add["camera"]
+    flag("--out", required=True, help="file to write, .npz")
+    flag("--frames", type=int, default=30, help="how many images (default: 30)")
     return parser.parse_args(argv)
 
 

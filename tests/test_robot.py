@@ -1245,7 +1245,7 @@ def test_one_check_of_poses_decides_wherever_they_come_from(
     start = np.array(START_POSE)
     frame = robot.Frame(time=0.0, points=None, seen=0, state=np.append(start, 0.0))
     with pytest.raises(RobotError, match="the one check"):  # a recorded episode
-        robot.finish([frame], [0.0], settings)
+        robot.episode_actions([frame], [0.0], settings)
     for motion in (lambda servo: servo.follow(STILL), lambda servo: servo.go(start)):
         with simulated_arm(settings, start) as arm:
             with pytest.raises(RobotError, match="the one check"):
