@@ -101,7 +101,7 @@ class Settings:
     crop_high_m: tuple = setting(MISSING, "its upper corner", **CORNER)
     camera_to_base: tuple = setting(MISSING, "pose of the DEPTH frame", **TRANSFORM)
     start_pose: tuple | None = setting(None, "where `run` begins", shape=(6,), least=-6.3, most=6.3)
-    outside_box: str = setting("stop", "what to do with such targets", choices=("stop", "clamp"))
+    outside_box: str = setting("stop", "for targets outside the box", choices=("stop", "clamp"))
     rotation_near_rad: tuple = setting((0, 3.14159, 0), "the reference of `nearer`", **CORNER)
     num_points: int = setting(1024, "points of a cloud", least=1, most=100_000)
     policy_hz: float = setting(10.0, "observations and actions a second", least=1, most=30)
@@ -975,7 +975,7 @@ class Servo:
         self.rtde = rtde
         self.settings = settings
         self.moves = moves  # False: a dry run
-        self.free = free
+        self.free = free  # True: the arm is only kept free to be moved by hand
         self.activity = activity or Activity()
 
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
@@ -1335,7 +1335,7 @@ class Cell:
         with self.activity.during("reading the gripper"):
             closed = self.gripper.read()
         state = np.append(pose, closed).astype(np.float32)
-        return Frame(time.monotonic(), points, seen, state)
+        return Frame(time=time.monotonic(), points=points, seen=seen, state=state)
 
     def prepare(self, moves: bool) -> None:
         """Raises RobotError if camera, gripper or arm are not ready; then initializes the gripper.
