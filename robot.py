@@ -6,12 +6,13 @@
     python robot.py run    --config robot.json --checkpoint adapted.pt --data demos/stack-cube.npz
     python robot.py camera --out scene.npz         # records depth images, for --camera
 
-All but the last with --host ADDRESS. Without an arm: `python -m tests.emulator`, and --host
-127.0.0.1. With --dry-run nothing is made to move.
+All but the last need --host ADDRESS, the robot's. Without an arm, `python -m tests.emulator`
+emulates one at 127.0.0.1. With --dry-run nothing is made to move.
 
 One action, from the network to the arm: `run` draws a chunk with `DAMIPolicy.sample_actions`,
-`Servo.follow` makes target poses of it, `Servo.tick` interpolates to 125 Hz and clamps, `RTDE.send`
-packs the bytes; on the controller `PROGRAM` reads the pose from registers and calls servoj.
+`Servo.follow` makes target poses of it, `Servo.tick` interpolates to 125 Hz and limits the speed,
+`RTDE.send` packs the bytes; on the controller `PROGRAM` reads the pose from registers and calls
+servoj.
 
 Poses are (x, y, z, rx, ry, rz): metres and axis-angle radians of the tool center point (TCP) in the
 robot's base frame. State (7,): TCP pose, gripper. Action (7,): dx, dy, dz in metres, drx, dry, drz
@@ -67,7 +68,10 @@ class CameraError(RobotError):
 
 
 class StaleState(RobotError):
-    """The newest state is too old. `arrived`: newer ones have, but this computer was too busy."""
+    """The newest state is too old.
+
+    `arrived`: newer ones have arrived, but this computer was too busy to read them.
+    """
 
     def __init__(self, message: str, arrived: bool) -> None:
         super().__init__(message)
@@ -88,17 +92,17 @@ class Settings:
 
     The first five have no default: they belong to the place where the arm stands. Raises
     ValueError, in one line, for a value of the wrong type, out of range, or at odds with another.
-    What an arm is to do is checked against them by `check_steps` and `check_poses`.
+    `check_steps` and `check_poses` tell whether the arm may do what it is to do.
     """
 
     tcp_low_m: tuple = setting(MISSING, "the box that the TCP stays in", **CORNER)
     tcp_high_m: tuple = setting(MISSING, "its upper corner", **CORNER)
     crop_low_m: tuple = setting(MISSING, "the box that points are kept in", **CORNER)
     crop_high_m: tuple = setting(MISSING, "its upper corner", **CORNER)
-    camera_to_base: tuple = setting(MISSING, "its DEPTH frame", **TRANSFORM)
+    camera_to_base: tuple = setting(MISSING, "pose of the DEPTH frame", **TRANSFORM)
     start_pose: tuple | None = setting(None, "where `run` begins", shape=(6,), least=-6.3, most=6.3)
-    outside_box: str = setting("stop", "what to do with such targets", choices=("stop", "clamp"))
-    rotation_near_rad: tuple = setting((0, 3.14159, 0), "the nearer of two vectors", **CORNER)
+    outside_box: str = setting("stop", "for targets outside the box", choices=("stop", "clamp"))
+    rotation_near_rad: tuple = setting((0, 3.14159, 0), "the reference of `nearer`", **CORNER)
     num_points: int = setting(1024, "points of a cloud", least=1, most=100_000)
     policy_hz: float = setting(10.0, "observations and actions a second", least=1, most=30)
     servo_hz: float = setting(125.0, "poses a second", least=100, most=500)
@@ -107,14 +111,14 @@ class Settings:
     max_step_m: float = setting(0.05, "a longer step is a jump, and stops", least=0.001, most=0.5)
     max_step_rad: float = setting(0.2, "so is a larger turn", least=0.001, most=3.0)
     max_state_age_s: float = setting(0.1, "an older state stops", least=0.01, most=1.0)
-    max_lag_m: float = setting(0.03, "the arm may stay so far behind", least=0.001, most=0.5)
-    max_lag_rad: float = setting(0.2, "and turned so far", least=0.001, most=3.0)
-    max_hold_s: float = setting(2.0, "waits for a late policy or camera", least=0.01, most=60)
-    servo_lookahead_s: float = setting(0.1, "of servoj: smooths", least=0.03, most=0.2)
+    max_lag_m: float = setting(0.03, "a longer lag stops", least=0.001, most=0.5)
+    max_lag_rad: float = setting(0.2, "so does a larger angle", least=0.001, most=3.0)
+    max_hold_s: float = setting(2.0, "so long a late policy is waited for", least=0.01, most=60)
+    servo_lookahead_s: float = setting(0.1, "of servoj: smooths motion", least=0.03, most=0.2)
     servo_gain: float = setting(300.0, "of servoj", least=100, most=2000)
     gripper_serial: str | None = setting(None, "such as /dev/ttyUSB0; null: gripper_port of --host")
     gripper_slave: int = setting(1, "Modbus address", least=1, most=247)
-    gripper_open_at: int = setting(1000, "per mille that is open", choices=(0, 1000))
+    gripper_open_at: int = setting(1000, "per mille where it is open", choices=(0, 1000))
     gripper_force_percent: int = setting(30, "of its force", least=20, most=100)
     rtde_port: int = setting(30004, "RTDE", **PORT)
     script_port: int = setting(30002, "the secondary interface", **PORT)
@@ -132,7 +136,8 @@ class Settings:
             if not np.less(low, high).all():
                 self.refuse(f"{box}_low_m", f"each number must be below that of {box}_high_m")
         for unit in ("m", "rad"):
-            speed, allowed = getattr(self, f"max_speed_{unit}_s"), getattr(self, f"max_lag_{unit}")
+            speed = getattr(self, f"max_speed_{unit}_s")
+            allowed = getattr(self, f"max_lag_{unit}")
             lag = speed * self.servo_lookahead_s  # of a healthy arm at full speed
             if lag > 0.9 * allowed:
                 why = f"at max_speed_{unit}_s the arm lags by {lag:.3f}: allow more, or be slower"
@@ -147,7 +152,7 @@ class Settings:
         raise ValueError(f"{name} in the robot's settings is {getattr(self, name)!r}: {why}")
 
     def check_steps(self, steps: Sequence[np.ndarray]) -> None:
-        """Raises RobotError if one of the steps (6 or 7,) is too far for one of 1 / policy_hz."""
+        """Raises RobotError if a step (6 or 7,), which takes 1 / policy_hz seconds, is a jump."""
         for step in steps:
             metres, radians = lengths(step)
             if metres > self.max_step_m or radians > self.max_step_rad:
@@ -158,7 +163,8 @@ class Settings:
     def check_poses(self, poses: Sequence[np.ndarray]) -> None:
         """Raises RobotError if the arm must not go through these poses (6,).
 
-        They are 1 / policy_hz apart, and each must be finite and inside the TCP's box.
+        Each must be finite and inside the TCP's box. They are 1 / policy_hz seconds apart, and the
+        steps between them must not be jumps.
         """
         if not np.isfinite(poses).all():
             raise RobotError("a pose is not finite")
@@ -182,16 +188,16 @@ def check_value(
     rigid: bool = False,
     help: str = "",
 ) -> None:
-    """Raises ValueError, saying what to write, where a setting cannot have a value.
+    """Raises ValueError, saying what to write, if a setting cannot have this value.
 
     Args:
         value: a number or text, or lists of lists of them.
         kind: its type as the field of `Settings` has it: "int", "str | None", "tuple" ...
         shape: of the lists; () is a single value.
-        choices: the values that are possible; (): any.
+        choices: the values that are possible; () is any.
         least, most: the range of its numbers.
-        rigid: it is a matrix (4, 4) that moves a rigid body.
-        help: is not used; it belongs to the field, as the others do.
+        rigid: whether it is a matrix (4, 4) that moves a rigid body.
+        help: is not used; it is in the field's metadata, as those above are.
     """
     if value is None and kind.endswith("None"):
         return
@@ -220,6 +226,9 @@ def load_settings(path: str | Path) -> Settings:
     """Reads --config. UserError, one line: missing, unknown, of the wrong type, out of range."""
     try:
         return Settings(**json.loads(Path(path).read_text()))
+    except OSError as error:
+        reason = f"{path} cannot be read ({error.strerror})"
+        raise UserError(f"{reason}: name it by --config, or copy assets/robot.json") from None
     except (TypeError, ValueError) as error:
         reason = str(error).removeprefix("Settings.__init__() ")
         raise UserError(f"{path}: {reason} (an example is assets/robot.json)") from None
@@ -308,8 +317,8 @@ class State(NamedTuple):
 class RTDE:
     """A client of the controller's RTDE interface, protocol version 2: one recipe each way.
 
-    A thread keeps the newest state. Nothing is connected again by itself: after a loss, make a new
-    one. A program that was made for this `session` follows what `send` writes, and no other does.
+    A thread keeps the newest state. A lost connection stays lost: make a new client. Only a program
+    that was made for this `session` follows what `send` writes.
     Raises RobotError: refused version, a field NOT_FOUND or IN_USE, lost connection or framing.
     """
 
@@ -355,6 +364,7 @@ class RTDE:
             raise self.lost("it does not start sending")
 
     def lost(self, what: str) -> RobotError:
+        """The error to raise: it names the controller, and ends with what that said last."""
         return RobotError(f"{self.name}: {what}{self.controller_said}")
 
     def recipe(self, reply: bytes, names: Sequence[str]) -> tuple[bytes, np.dtype]:
@@ -373,28 +383,36 @@ class RTDE:
         return reply[:1], np.dtype([(name, FORMATS[kind]) for name, kind in zip(names, types)])
 
     def package(self) -> tuple[int, bytes]:
-        """The next package's type and payload, however the bytes were split or joined."""
+        """The type and payload of the next package that is no text message; those are kept."""
         while True:
-            if len(self.buffer) >= HEADER.size:
-                size, kind = HEADER.unpack_from(self.buffer)
-                if size < HEADER.size:
-                    raise self.lost(f"framing lost (a package of {size} bytes)")
-                if len(self.buffer) >= size:
-                    payload = self.buffer[HEADER.size : size]
-                    self.buffer = self.buffer[size:]
-                    if kind != MESSAGE:
-                        return kind, payload
-                    text = payload[1 : 1 + payload[0]] if payload else b""
-                    message = text.decode("ascii", "replace")
-                    self.controller_said = f"; the controller said: {message}"
-                    continue
-            try:
-                received = self.socket.recv(65536)
-            except OSError as error:  # a time-out, too
-                raise self.lost(f"connection lost, or no answer: {error}") from None
-            if not received:
-                raise self.lost("connection closed by the controller")
-            self.buffer += received
+            kind, payload = self.any_package()
+            if kind != MESSAGE:
+                return kind, payload
+            text = payload[1 : 1 + payload[0]] if payload else b""
+            self.controller_said = f"; the controller said: {text.decode('ascii', 'replace')}"
+
+    def any_package(self) -> tuple[int, bytes]:
+        """The next package's type and payload, however the bytes were split or joined."""
+        while len(self.buffer) < HEADER.size:
+            self.receive()
+        size, kind = HEADER.unpack_from(self.buffer)
+        if size < HEADER.size:
+            raise self.lost(f"framing lost (a package of {size} bytes)")
+        while len(self.buffer) < size:
+            self.receive()
+        payload = self.buffer[HEADER.size : size]
+        self.buffer = self.buffer[size:]
+        return kind, payload
+
+    def receive(self) -> None:
+        """Appends to the buffer what arrives next."""
+        try:
+            received = self.socket.recv(65536)
+        except OSError as error:  # a time-out, too
+            raise self.lost(f"connection lost, or no answer: {error}") from None
+        if not received:
+            raise self.lost("connection closed by the controller")
+        self.buffer += received
 
     def request(self, kind: int, payload: bytes) -> bytes:
         """Sends a package and returns the payload of the answer, which has the same type."""
@@ -437,14 +455,19 @@ class RTDE:
             raise RobotError(str(self.error))
         age = time.monotonic() - self.newest.received if self.newest else math.inf
         if age > max_age:
-            with suppress(OSError, ValueError):  # closed meanwhile
-                arrived = bool(select.select([self.socket], [], [], 0)[0])
-                raise StaleState(str(self.lost(f"the newest state is {age:.3f} s old")), arrived)
-            raise self.lost("connection closed")
+            try:
+                readable, _, _ = select.select([self.socket], [], [], 0)
+            except (OSError, ValueError):  # closed meanwhile
+                raise self.lost("connection closed") from None
+            message = str(self.lost(f"the newest state is {age:.3f} s old"))
+            raise StaleState(message, arrived=bool(readable))
         return self.newest
 
     def send(self, pose: np.ndarray, stop: bool = False) -> None:
-        """Writes a target pose (6,) for the program, or tells it to end, the last thing sent."""
+        """Writes a target pose (6,) for the program; with `stop` tells it to end.
+
+        After a stop nothing is sent any more.
+        """
         with self.lock:
             if self.stopped:
                 return
@@ -472,13 +495,15 @@ class RTDE:
 
 # ---- The controller's program and its other ports ------------------------------------------------
 
-MISSING_PACKAGES = 10  # for which the watchdog waits: 80 ms at 125 Hz
+MISSING_PACKAGES = 10  # the watchdog waits for so many: 80 ms at 125 Hz
 
-# What runs on the controller. It ends when told to, when RTDE is late (the watchdog, so that no arm
-# moves or stays free whose computer is gone), or when no inverse kinematics is found. The session
-# says whose it is; the number of the package followed last says that it runs. A pose is six reads,
-# between which the next package may arrive: the numbers before and behind it are then different.
-# The watchdog rests before the arm is braked: nobody writes then, and it would cut that short.
+# What runs on the controller. It ends when it is told to, when no inverse kinematics is found, or
+# when RTDE is late: then the watchdog ends it, so that no arm moves or stays free whose computer is
+# gone. Output register 24 holds the session, which tells whose program it is, and 25 the number of
+# the package that it followed last, which tells that it runs. To read a pose takes six reads, and
+# the next package may arrive between them: then the package's two numbers, read before and after
+# the pose, are different, and the pose is not followed. The watchdog is switched off before the arm
+# is braked: nothing is sent then, and the watchdog would cut the braking short.
 PROGRAM = """def dami():
   rtde_set_watchdog("input_int_register_24", {watchdog_hz:.1f}, "stop")
   write_output_integer_register(25, 0)
@@ -523,7 +548,7 @@ def program(session: int, settings: Settings, free: bool) -> str:
 
 @contextmanager
 def port_of(host: str, port: int, what: str) -> Iterator[socket.socket]:
-    """A connection, whose errors are those of the robot."""
+    """A connection to a port of the controller; what fails inside is a RobotError."""
     try:
         with socket.create_connection((host, port), 2.0) as connection:
             yield connection
@@ -534,13 +559,14 @@ def port_of(host: str, port: int, what: str) -> Iterator[socket.socket]:
 def upload(host: str, port: int, text: str, waiting: Callable = lambda: None) -> None:
     """Sends a URScript program; the controller ends the one that runs and starts this one.
 
-    Until the port has answered, `waiting` is called again and again: the program may run already.
+    While the port has not answered, `waiting` is called again and again, to write the poses without
+    which the watchdog would end the program, which may run already.
     """
     with port_of(host, port, "the script port") as connection:
         connection.sendall(text.encode())
         deadline = time.monotonic() + 2
         received = 0  # bytes
-        while received < 79:  # one that closes without having read may have its program discarded
+        while received < 79:  # the program of a client that has read less may be discarded
             waiting()
             if not select.select([connection], [], [], 0.01)[0]:
                 if time.monotonic() > deadline:
@@ -625,7 +651,10 @@ class Gripper:
         self.close = self.port.close
 
     def exchange(self, function: int, register: int, value: int) -> int:
-        """Writes a register, or reads one (`value` 1: so many); the value in the answer."""
+        """Writes `value` to a register, or reads one; returns the value in the answer.
+
+        To read, `value` is how many registers are asked for: 1.
+        """
         request = struct.pack(">BBHH", self.settings.gripper_slave, function, register, value)
         request += crc16(request)
         for _ in range(self.RETRIES):
@@ -640,7 +669,7 @@ class Gripper:
                 continue
             if len(answer) < 5:
                 problem = "no answer"
-                time.sleep(self.timeout)  # a late one must not be taken for the next
+                time.sleep(self.timeout)  # a late answer must not be taken for the next one
             elif crc16(answer[:-2]) != answer[-2:]:
                 problem = "bad check sum"
             elif answer[1] == function | 0x80:
@@ -653,7 +682,7 @@ class Gripper:
         raise RobotError(f"the gripper at {self.where}: {problem}")
 
     def initialize(self, timeout: float = 10.0) -> None:
-        """Initializes it if that was not done yet (it opens and closes), and sets the force."""
+        """Initializes the gripper, which opens and closes, if it is not; then sets the force."""
         if self.exchange(READ, INITIALIZED, 1) != 1:
             self.exchange(WRITE, INITIALIZE, 1)
             deadline = time.monotonic() + timeout
@@ -692,8 +721,13 @@ def depth_to_points(depth: np.ndarray, intrinsics: Sequence[float]) -> np.ndarra
     return np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=-1).astype(np.float32)
 
 
-def to_base(depth: np.ndarray, intrinsics: Sequence[float], settings: Settings) -> list[np.ndarray]:
-    """Depth (H, W), metres -> points (M, 3) float32, base frame; those in the crop box."""
+def to_base(
+    depth: np.ndarray, intrinsics: Sequence[float], settings: Settings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W), metres -> points float32, base frame: all (M, 3), those in the crop box (K, 3).
+
+    Raises CameraError if there are none.
+    """
     points = depth_to_points(depth, intrinsics)
     if len(points) == 0:
         raise CameraError("the camera's depth is empty: check its cable, power and what it sees")
@@ -702,22 +736,24 @@ def to_base(depth: np.ndarray, intrinsics: Sequence[float], settings: Settings) 
     kept = ((points >= settings.crop_low_m) & (points <= settings.crop_high_m)).all(axis=1)
     if not kept.any():
         raise CameraError("no point lies in the crop box: check camera_to_base and crop_low_m")
-    return [points, points[kept]]
+    return points, points[kept]
 
 
 SAMPLED_FROM = 8192  # points at most: 10 ms
 
 
-def cloud(depth: np.ndarray, intrinsics: Sequence[float], settings: Settings) -> tuple:
-    """Depth (H, W), metres -> the policy's points (N, 3) float32, base frame; from how many (int).
+def cloud(
+    depth: np.ndarray, intrinsics: Sequence[float], settings: Settings
+) -> tuple[np.ndarray, int]:
+    """Depth (H, W), metres -> the policy's points (N, 3) float32, base frame; from how many.
 
-    They are cropped and farthest point sampled. Fewer than N are repeated; of many, every second,
-    third ... is sampled from: sampling keeps Python's lock, in which no other thread runs, and
-    300 000 points would hold up the servo stream for a quarter of a second.
+    The points in the crop box are farthest point sampled. Fewer than N are repeated. Of more than
+    SAMPLED_FROM only every second, third ... is kept before: sampling holds Python's lock, so that
+    no other thread runs, and 300 000 points would delay the servo stream by a quarter of a second.
     """
     _, points = to_base(depth, intrinsics, settings)
-    some = points[:: math.ceil(len(points) / SAMPLED_FROM)]
-    return data.farthest_point_sample(some, settings.num_points), len(points)
+    thinned = points[:: math.ceil(len(points) / SAMPLED_FROM)]
+    return data.farthest_point_sample(thinned, settings.num_points), len(points)
 
 
 class RealSense:
@@ -744,8 +780,9 @@ class RealSense:
         deadline = time.monotonic() + 1.0
         try:
             while time.monotonic() < deadline:
-                there, found = self.pipeline.try_wait_for_frames(30)  # in it Ctrl-C is not heard
-                if there and (frame := found.get_depth_frame()):
+                arrived, frames = self.pipeline.try_wait_for_frames(30)  # ms: Ctrl-C must wait
+                frame = frames.get_depth_frame() if arrived else None
+                if frame:
                     return np.asarray(frame.get_data()).astype(np.float32) * self.unit
         except RuntimeError as error:
             raise CameraError(f"the RealSense camera: {error}") from None
@@ -753,7 +790,7 @@ class RealSense:
 
 
 def realsense_intrinsics(stream: Any) -> tuple[float, ...]:
-    """Of a pyrealsense2 stream profile."""
+    """Focal lengths and principal point, in pixels, of a pyrealsense2 stream profile."""
     i = stream.as_video_stream_profile().get_intrinsics()
     return i.fx, i.fy, i.ppx, i.ppy
 
@@ -790,7 +827,7 @@ WRITING = "writing the recording"
 
 
 class Activity:
-    """What the main thread is at, and was: what to blame when the servo's thread runs late."""
+    """What the main thread does and did lately: what to blame if the servo's thread runs late."""
 
     def __init__(self) -> None:
         self.current: tuple[str, float] | None = None  # name, began
@@ -798,7 +835,7 @@ class Activity:
 
     @contextmanager
     def during(self, name: str) -> Iterator[None]:
-        """Inside, the main thread is at this."""
+        """Inside, the main thread does this."""
         began = time.monotonic()
         self.current = (name, began)
         try:
@@ -808,13 +845,17 @@ class Activity:
             self.current = None
 
     def longest(self, since: float, now: float) -> tuple[str, float]:
-        """What took longest between two times, and how many seconds of them."""
-        took = {"waiting": 0.0}
-        current = self.current
-        running = [(*current, now)] if current else []
-        for name, began, ended in [*self.ended, *running]:
-            took[name] = took.get(name, 0.0) + max(0.0, min(ended, now) - max(began, since))
-        return max(took.items(), key=lambda item: item[1])
+        """What the main thread did longest between two times, and for how many seconds of them."""
+        intervals = list(self.ended)
+        current = self.current  # read once: the main thread changes it meanwhile
+        if current is not None:
+            name, began = current
+            intervals.append((name, began, now))
+        seconds = {"waiting": 0.0}
+        for name, began, ended in intervals:
+            overlap = min(ended, now) - max(began, since)
+            seconds[name] = seconds.get(name, 0.0) + max(0.0, overlap)
+        return max(seconds.items(), key=lambda item: item[1])
 
 
 # ---- Streaming motion ----------------------------------------------------------------------------
@@ -829,10 +870,10 @@ def quaternion(rotvec: Sequence[float]) -> tuple[float, float, float, float]:
 
 
 def rotate(rotvec: Sequence[float], turn: Sequence[float]) -> np.ndarray:
-    """The rotation vector (3,) of one rotation, then another; its angle is at most pi.
+    """The rotation vector (3,) of one rotation, then a further turn; its angle is at most pi.
 
-    Plain numbers, and not an array library: the servo's thread does this ten times in 8 ms, and it
-    takes five microseconds, in which it keeps Python's lock from all others.
+    In plain numbers, which take a tenth of the time that arrays of three numbers take: the servo's
+    thread does this ten times in 8 ms, and keeps Python's lock from all other threads meanwhile.
     """
     aw, ax, ay, az = quaternion(turn)
     bw, bx, by, bz = quaternion(rotvec)
@@ -885,7 +926,8 @@ def distance(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
 def toward(pose: np.ndarray, target: np.ndarray, most: np.ndarray) -> np.ndarray:
     """From pose to target (6,), by no more than (metres, radians): straight, and on SO(3)."""
     step = difference(pose, target)
-    return compose(pose, step * np.repeat(np.minimum(1, most / lengths(step).clip(1e-12)), 3))
+    shares = np.minimum(1, most / lengths(step).clip(1e-12))  # (2,) of the way, of the turn
+    return compose(pose, step * np.repeat(shares, 3))
 
 
 def warn(text: str) -> None:
@@ -899,8 +941,9 @@ class Servo:
     holds the last target when all are reached. With `free` it only keeps the arm free to be moved
     by hand. It stops for good, and says why, when
 
-    - the newest state is older than `max_state_age_s`, or that much later than the promptest, the
-      connection or its framing is lost, or the controller's clock stands still or runs backwards;
+    - the newest state is older than `max_state_age_s`, or arrives later by that than the promptest
+      one did; the connection or its framing is lost; the controller's clock stands still or runs
+      backwards;
     - the robot is not running, its safety mode is neither normal nor reduced, its speed slider is
       not at 100 %, or our program is paused, has ended, or has been replaced by another;
     - the arm is farther than `max_lag_m` or `max_lag_rad` from where it should be;
@@ -908,15 +951,17 @@ class Servo:
     - an action has the wrong shape, NaN, or a jump; no new ones come for `max_hold_s`.
 
     To stop is to tell the program on the controller to end, once; nothing is sent after that.
+
     An arm that follows `servoj` is behind by about its lookahead time. So no pose is sent that is
-    farther ahead of the measured one than the arm may go in that time: held back and let go, it is
-    not faster than allowed. The targets move a little slower, for the delay of what is measured.
+    farther ahead of the measured one than the arm may go in that time: then an arm that was held
+    back, and is let go, is not faster than allowed. As the measured pose is old by `DELAY`, targets
+    move a little slower than the arm may.
     """
 
     DELAY = 0.025  # seconds from measuring a pose to following the answer
     PATIENCE = 5.0  # seconds for the program to start
-    REACHED = 1e-6  # metres and radians from the target: nothing is left to go
-    STANDS = 1e-7  # metres and radians of a step: the slowest arm allowed goes ten times as far
+    REACHED = 1e-6  # metres and radians: a target that is nearer has been reached
+    STANDS = 1e-7  # metres and radians: a step of the slowest arm allowed is ten times as long
     SLOW = "the policy or the camera is too slow"
 
     def __init__(
@@ -930,28 +975,28 @@ class Servo:
         self.rtde = rtde
         self.settings = settings
         self.moves = moves  # False: a dry run
-        self.free = free
+        self.free = free  # True: the arm is only kept free to be moved by hand
         self.activity = activity or Activity()
 
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
-        self.sent = self.pose  # sent last: not farther ahead of the arm than `lead`
+        self.sent = self.pose  # sent last: ahead of the measured pose by no more than `lead`
         fastest = np.array([settings.max_speed_m_s, settings.max_speed_rad_s])
         lookahead = settings.servo_lookahead_s
         self.lead = fastest * lookahead  # (2,) metres, radians
         self.speed = self.lead / (lookahead + self.DELAY)  # (2,) a second, of the targets
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
-        self.broken_off = False  # targets were left out
+        self.broken_off = False  # targets were left out, by `hold`
         self.held_since = time.monotonic()
         self.missing = self.SLOW  # why the arm holds
 
         self.lock = threading.Lock()  # of the targets
         self.error: str | None = None  # why the arm was stopped
         self.ended = threading.Event()
-        self.changed: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
-        self.delay = math.inf  # of the promptest state, and a constant
-        self.last_step = (time.monotonic(), time.process_time())  # when, and computed until then
+        self.counters: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
+        self.delay = math.inf  # of the promptest state; like all delays, plus a constant
+        self.last_step = (time.monotonic(), time.process_time())  # of the stream
         self.stall = ""  # why the stream stood still for so long that the watchdog may have struck
-        self.stalled_at = -math.inf
+        self.stalled_at = -math.inf  # when that was noticed
 
         self.lateness: list[float] = []  # seconds, of each package
         self.ages: list[float] = []  # seconds, of the state that each package answers
@@ -968,19 +1013,11 @@ class Servo:
             state = self.rtde.state(settings.max_state_age_s)
             self.pose = state.pose  # not an older one: the arm may have been moved meanwhile
             try:
-                state.check()
-                if not self.free:
-                    settings.check_poses([self.pose])
-                if time.monotonic() > deadline:
-                    raise RobotError(
-                        f"its program does not start: remote control?{self.rtde.controller_said}"
-                    )
-                if not self.moves or self.rtde.program_runs(state):
-                    break
-                if not uploaded and state.values["robot_status_bits"] & PROGRAM_RUNNING:
-                    raise RobotError("another program runs there, stop it first")
+                self.check_start(state, deadline, uploaded)
             except RobotError as error:
                 raise RobotError(f"the arm is not moved: {error}") from None
+            if not self.moves or self.rtde.program_runs(state):
+                break
             self.send(self.pose)
             if not uploaded:
                 text = program(self.rtde.session, settings, self.free)
@@ -990,6 +1027,18 @@ class Servo:
         self.held_since = time.monotonic()
         self.last_step = (self.held_since, time.process_time())
         self.thread.start()
+
+    def check_start(self, state: State, deadline: float, uploaded: bool) -> None:
+        """Raises RobotError if the program must not be started in this state, or does not start."""
+        state.check()
+        if not self.free:
+            self.settings.check_poses([state.pose])
+        if time.monotonic() > deadline:
+            raise RobotError(
+                f"its program does not start: remote control?{self.rtde.controller_said}"
+            )
+        if self.moves and not uploaded and state.values["robot_status_bits"] & PROGRAM_RUNNING:
+            raise RobotError("another program runs there, stop it first")
 
     def send(self, pose: np.ndarray) -> None:
         self.sent = pose
@@ -1003,19 +1052,19 @@ class Servo:
                 raise RobotError(f"actions have the shape {actions.shape}, not (n, {ACTION_DIM})")
             if not np.isfinite(actions).all():
                 raise RobotError("an action is not finite")
-            self.settings.check_steps(actions)  # as asked: clamped to the box, none may be a jump
+            self.settings.check_steps(actions)  # before a jump is cut short by the box
             poses = [self.pose]
             for action in actions:
                 poses.append(self.into_box(compose(poses[-1], action)))
             self.settings.check_poses(poses)
-            when = time.monotonic() + np.arange(1, len(poses)) / self.settings.policy_hz
-            self.targets = list(zip(when, poses[1:]))
+            times = time.monotonic() + np.arange(1, len(poses)) / self.settings.policy_hz
+            self.targets = list(zip(times, poses[1:]))
             self.broken_off = False
         self.slowed += self.too_fast(actions)
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
-        """Inside, an error stops the arm before it is raised; if it was stopped, that is raised."""
+        """Inside, an error stops the arm, and is raised; so is that of an arm stopped before."""
         self.check()
         try:
             yield
@@ -1024,21 +1073,21 @@ class Servo:
         self.check()
 
     def hold(self) -> None:
-        """Leaves out the targets that are left: what comes next follows from where the arm is."""
+        """Holds the arm where it is now: the targets that it has not reached are left out."""
         with self.lock:
             self.broken_off = self.broken_off or bool(self.targets)
             self.targets = []
 
     def too_fast(self, actions: np.ndarray) -> int:
-        """How many actions (n, 7) ask for more than the speed allowed: they are cut short."""
+        """How many of the actions (n, 7) are faster than the arm may go: they are cut short."""
         return int((lengths(actions) * self.settings.policy_hz > self.speed).any(axis=1).sum())
 
     def go(self, pose: np.ndarray) -> None:
         """Goes straight to a pose (6,) at a quarter of the speed allowed; returns when there.
 
-        The line is divided into targets that are 0.1 s apart, whatever `policy_hz` and `max_step_m`
-        say of a policy's steps. The last of them is repeated until an arm that lags by servoj's
-        lookahead time has arrived, too. The box is convex: with both ends the line lies in it.
+        The line is divided into targets that are 0.1 s apart; `policy_hz` and `max_step_m` are for
+        a policy's steps alone. The last target is repeated, until the arm, which lags by servoj's
+        lookahead time, has arrived, too. The box is convex: with both ends the line lies in it.
         """
         with self.stopping(), self.lock:
             start = self.pose
@@ -1052,12 +1101,12 @@ class Servo:
             self.targets = [
                 (now + seconds * i / n, compose(start, step * i / n)) for i in range(1, n + 1)
             ]
-            arrived = now + seconds + 3 * self.settings.servo_lookahead_s
-            self.targets.append((arrived, self.targets[-1][1]))
+            arrival = now + seconds + 3 * self.settings.servo_lookahead_s
+            self.targets.append((arrival, self.targets[-1][1]))
             self.broken_off = False
         while self.targets:
             with self.stopping():
-                if time.monotonic() > arrived + 1.0:
+                if time.monotonic() > arrival + 1.0:
                     raise RobotError("the pose that the arm was sent to is not reached")
             time.sleep(0.01)
         self.check()
@@ -1078,14 +1127,14 @@ class Servo:
                 self.targets.pop(0)
             if self.targets:
                 when, target = self.targets[0]
-                share = min(1.0, dt / max(when - now + dt, dt))
-                goal = compose(self.pose, share * difference(self.pose, target))
+                share = min(1.0, dt / max(when - now + dt, dt))  # of what is left, in this tick
                 before = self.pose
+                goal = compose(before, share * difference(before, target))
                 self.pose = toward(before, goal, self.speed * dt)
                 if when <= now and distance(self.pose, target).max() < self.REACHED:
                     self.targets = []
                 if when > now or distance(self.pose, before).max() > self.STANDS:
-                    self.held_since = now  # an overdue target, too, while the arm comes nearer
+                    self.held_since = now  # on its way: overdue perhaps, but coming nearer
             return self.pose
 
     def stream(self) -> None:
@@ -1129,9 +1178,9 @@ class Servo:
     def describe_stall(self) -> str:
         """With what this computer was busy since the last step of the stream.
 
-        A thread of this program that computes in a library may keep Python's lock, so that no other
-        thread runs; then the program has used a processor meanwhile. If it has not, it waited for
-        the disk, or other programs had the processors.
+        If this program has computed most of the time, a thread of it has kept Python's lock, in a
+        library perhaps, so that no other thread ran. If it has not, it waited for the disk, or
+        other programs had the processors.
         """
         before, computed_before = self.last_step
         now = time.monotonic()
@@ -1168,10 +1217,7 @@ class Servo:
         """Raises RobotError if controller or program do not go on, or states come later."""
         max_age = self.settings.max_state_age_s
         values = state.values
-        delay = now - values["timestamp"]  # and a constant
-        # Clocks may drift apart by a thousandth.
-        self.delay = min(self.delay + 1e-3 / self.settings.servo_hz, delay)
-        watched = {"the controller's clock": values["timestamp"]}
+        counters = {"the controller's clock": values["timestamp"]}
         if self.moves:
             if not self.rtde.program_runs(state):
                 stall = self.stall if now - self.stalled_at < 1 else ""  # the watchdog ended it
@@ -1179,16 +1225,21 @@ class Servo:
                     "the program on the controller has ended, or is paused"
                     f"{self.rtde.controller_said}{stall}"
                 )
-            watched["our program"] = values["output_int_register_25"]
-        for name, value in watched.items():
-            old, since = self.changed.get(name, (value, now))
+            counters["our program"] = values["output_int_register_25"]
+        for name, value in counters.items():
+            old, since = self.counters.get(name, (value, now))
             if value < old:
                 raise RobotError(f"{name} runs backwards")
             if now - since > 2 * max_age:
                 raise RobotError(f"{name} stands still")
-            self.changed[name] = (value, now if value > old else since)
-        ticks = self.changed["the controller's clock"][1] == now
-        if ticks and delay - self.delay > max_age:
+            self.counters[name] = (value, now if value > old else since)
+
+        delay = now - values["timestamp"]  # plus a constant: the clocks began at different times
+        drift = 1e-3 / self.settings.servo_hz  # clocks may drift apart by a thousandth
+        self.delay = min(self.delay + drift, delay)
+        _, since = self.counters["the controller's clock"]
+        state_is_new = since == now
+        if state_is_new and delay - self.delay > max_age:
             raise RobotError(f"states arrive {delay - self.delay:.3f} s later than at first")
 
     def check(self) -> None:
@@ -1201,10 +1252,10 @@ class Servo:
         self.error = self.error or reason
         with suppress(RobotError):  # a lost connection: the watchdog on the controller stops it
             if self.moves:
-                self.rtde.send(self.sent, stop=True)  # nothing new to follow
+                self.rtde.send(self.sent, stop=True)  # with the old pose: no new one is followed
 
     def stop(self) -> None:
-        """Ends the stream and the program on the controller, and says if that goes on."""
+        """Ends the stream and the program on the controller, and warns if a program goes on."""
         self.ended.set()
         self.fail("stopped")
         age = self.settings.max_state_age_s
@@ -1212,11 +1263,12 @@ class Servo:
         with suppress(RobotError):  # a lost connection says nothing about the program
             while self.moves and self.rtde.program_runs(self.rtde.state(age)):
                 if time.monotonic() > deadline:
-                    return warn("a program on the controller does not end: stop it by hand")
+                    warn("a program on the controller does not end: stop it by hand")
+                    break
                 time.sleep(0.01)
 
     def report(self) -> str:
-        """How regular the stream was, and a warning for what was not done as asked."""
+        """Says how regular the stream was, and warns of what was not done as asked."""
         if self.clamped:
             warn(f"{self.clamped} targets lay outside the box and were clamped")
         if self.slowed:
@@ -1257,9 +1309,10 @@ class Cell:
     activity: Activity
 
     def observe(self, servo: Servo | None = None) -> Frame:
-        """The present observation; while there is none `servo` holds the arm, until it stops it.
+        """The present observation.
 
-        What was left to do is left out: the arm goes nowhere that is not seen.
+        While the camera gives none, `servo` holds the arm, which goes nowhere that is not seen, and
+        stops it after `max_hold_s`. Without a servo that is a CameraError at once.
         """
         while True:
             try:
@@ -1282,10 +1335,13 @@ class Cell:
         with self.activity.during("reading the gripper"):
             closed = self.gripper.read()
         state = np.append(pose, closed).astype(np.float32)
-        return Frame(time.monotonic(), points, seen, state)
+        return Frame(time=time.monotonic(), points=points, seen=seen, state=state)
 
     def prepare(self, moves: bool) -> None:
-        """Camera, gripper and arm must answer before anything moves; then readies the gripper."""
+        """Raises RobotError if camera, gripper or arm are not ready; then initializes the gripper.
+
+        Nothing moves before all three have answered; without `moves` nothing moves at all.
+        """
         self.observe()
         try:
             self.rtde.state(self.settings.max_state_age_s).check()
@@ -1295,7 +1351,10 @@ class Cell:
             self.gripper.initialize()
 
     def made_with(self, recording: Demonstrations | None = None) -> dict:
-        """What recordings tell of the robot. UserError for one that was made with another."""
+        """What a recording's `meta` tells of the robot.
+
+        Raises UserError if `recording` was made with a robot of other settings.
+        """
         settings = self.settings
         values = self.rtde.state(settings.max_state_age_s).values
         now = {
@@ -1306,16 +1365,21 @@ class Cell:
             "gripper_open_at": settings.gripper_open_at,
             "workspace": boxes(settings)["workspace"],
         }
-        for name, value in now.items():
-            recorded = recording.meta.get(name) if recording else value
-            if name == "tcp_offset" and same_tcp(recorded, value):
-                continue
-            if recorded != value:
-                raise UserError(
-                    f"{recording.task} was recorded with {name} {recorded}, now it is {value}: "
-                    "set it as it was, or record again"
-                )
+        if recording is not None:
+            check_same_robot(recording, now)
         return {**now, **boxes(settings), "positions_in_state": 1}
+
+
+def check_same_robot(recording: Demonstrations, now: dict) -> None:
+    """Raises UserError for a value that the recording's `meta` has otherwise than it is now."""
+    for name, value in now.items():
+        recorded = recording.meta.get(name)
+        same = same_tcp(recorded, value) if name == "tcp_offset" else recorded == value
+        if not same:
+            raise UserError(
+                f"{recording.task} was recorded with {name} {recorded}, now it is {value}: "
+                "set it as it was, or record again"
+            )
 
 
 def same_tcp(recorded: Any, offset: list[float]) -> bool:
@@ -1328,7 +1392,10 @@ def same_tcp(recorded: Any, offset: list[float]) -> bool:
 
 
 def boxes(settings: Settings) -> dict:
-    """Two corners each: the box of the points, about whose middle augmentation turns, the TCP's."""
+    """The two boxes as recordings name them, two corners each.
+
+    `workspace` is that of the points: augmentation turns scenes about its middle.
+    """
     return {
         "workspace": [list(settings.crop_low_m), list(settings.crop_high_m)],
         "tcp_box": [list(settings.tcp_low_m), list(settings.tcp_high_m)],
@@ -1391,7 +1458,7 @@ def to_recording(
 
 
 def save(out: Path, recording: Demonstrations) -> Demonstrations:
-    """Writes a recording, and names the path where the disk is full."""
+    """Writes a recording and returns it; UserError names the path where the disk is full."""
     try:
         data.save_demonstrations(out, recording)
     except OSError as error:
@@ -1403,7 +1470,7 @@ def save(out: Path, recording: Demonstrations) -> Demonstrations:
 
 
 def run(args: argparse.Namespace, settings: Settings) -> None:
-    """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and again."""
+    """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and so on."""
     common.pick_device(args.device)
     policy, info = model.load(args.checkpoint, args.device, needs=("text_weights",))
     config = policy.config
@@ -1429,7 +1496,8 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
         context = policy.encode_demo(text.to(args.device), **demo)
 
     def act(frames: list[Frame]) -> np.ndarray | None:
-        if not frames[-1].time - frames[0].time < args.seconds:  # NaN seconds, too
+        seconds = frames[-1].time - frames[0].time
+        if not seconds < args.seconds:  # in this form NaN ends it at once, too
             return None
         padded = [frames[0]] * config.n_obs_steps + frames
         observed = padded[-config.n_obs_steps :]  # To frames
@@ -1463,7 +1531,7 @@ def replay(args: argparse.Namespace, settings: Settings) -> None:
 
 @dataclass
 class Log:
-    """What was seen and done, as it is written when it ends."""
+    """What was seen and done since the start; `drive` writes it in the end."""
 
     frames: list[Frame] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)  # (7,)
@@ -1497,10 +1565,11 @@ def drive(
     act: Callable[[list[Frame]], np.ndarray | None],
     start: Sequence[float] | None,
 ) -> None:
-    """Executes the chunks (Ta, 7) with which `act` answers all frames seen, until it says None.
+    """Executes the chunks (Ta, 7) that `act` makes of all frames seen, until it returns None.
 
-    If camera or gripper are late, or fail, what is left of a chunk is left out. Frames and actions
-    are written to a file in the format of recordings, however it ends, but by a second Ctrl-C.
+    If camera or gripper are late, or fail, the rest of a chunk is left out. However this ends,
+    frames and actions are written to a file in the format of recordings; only a second Ctrl-C may
+    prevent that.
     """
     name = f"{recording.task}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.npz"
     out = Path(args.out or f"runs/robot/{name}")
@@ -1535,7 +1604,7 @@ def drive(
 
 
 def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
-    """Executes the actions (Ta, 7) of a chunk, and logs them and what is seen after each."""
+    """Executes the actions (Ta, 7) of a chunk; logs them, and what is seen after each."""
     period = 1 / servo.settings.policy_hz
     servo.follow(chunk)
     began = time.monotonic()
@@ -1554,7 +1623,7 @@ def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
         log.frames.append(cell.observe(servo))
         late = time.monotonic() - due
         if step < len(chunk) and late > period:
-            servo.hold()  # the gripper must act where the arm was to be then
+            servo.hold()  # the arm has gone on, so the gripper's next action is late for its place
         if servo.broken_off:
             return
 
@@ -1563,10 +1632,9 @@ def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
 
 
 class Keys:
-    """The keys pressed so far, one at a time, without waiting.
+    """The keys pressed so far, one at a time, without waiting; where from: see `record`.
 
-    They are those of the terminal, where no Enter is needed. Where standard input is no terminal,
-    they are what a script, or the driver of a foot pedal, writes into it; its end means `q`.
+    In a terminal no Enter is needed.
     """
 
     def __enter__(self) -> Keys:
@@ -1588,7 +1656,7 @@ class Keys:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self.attributes)
 
     def pressed(self) -> str:
-        """One key, or an empty string. Raises RobotError where the terminal is gone."""
+        """One key, or an empty string if none was pressed. RobotError: the terminal is gone."""
         while select.select([sys.stdin], [], [], 0)[0]:
             key = os.read(sys.stdin.fileno(), 1).decode("ascii", "replace")  # unbuffered
             if key == "" and self.terminal:
@@ -1600,8 +1668,8 @@ class Keys:
         return ""
 
 
-def finish(frames: list[Frame], grip: list[float], settings: Settings) -> np.ndarray:
-    """Frames (T) and the gripper's commands (T) -> actions (T, 7), each leads to the next frame.
+def episode_actions(frames: list[Frame], grip: list[float], settings: Settings) -> np.ndarray:
+    """Frames (T) and the gripper's commands (T) -> actions (T, 7); each leads to the next frame.
 
     Raises RobotError for an episode that `run` could not execute.
     """
@@ -1609,8 +1677,9 @@ def finish(frames: list[Frame], grip: list[float], settings: Settings) -> np.nda
     settings.check_poses(poses)
     times = [frame.time for frame in frames]
     gaps = np.diff(times) if len(times) > 1 else np.zeros(1)  # seconds
+    # An action takes 1 / policy_hz seconds: `replay` would be faster than the hand was.
     if gaps.max() > 2 / settings.policy_hz or gaps.mean() > 1.2 / settings.policy_hz:
-        raise RobotError(  # replay would be faster
+        raise RobotError(
             f"frames are {gaps.mean():.2f}, up to {gaps.max():.2f} s apart, camera or gripper were "
             "late"
         )
@@ -1620,7 +1689,7 @@ def finish(frames: list[Frame], grip: list[float], settings: Settings) -> np.nda
 
 @dataclass
 class Recorder:
-    """The episode at hand, and those that are kept."""
+    """The episode that is being recorded, and those that are kept."""
 
     args: argparse.Namespace
     cell: Cell
@@ -1628,8 +1697,8 @@ class Recorder:
     meta: dict
     kept: Demonstrations | None  # all episodes of the file
     count: int = 0  # episodes kept since the start
-    closed: float = 0.0  # what the gripper was told: 1 closed
-    frames: list[Frame] | None = None  # of the episode at hand; None: there is none
+    closed: float = 0.0  # the gripper's command: 0 open, 1 closed
+    frames: list[Frame] | None = None  # of the episode that is being recorded; None: there is none
     grip: list[float] = field(default_factory=list)  # the gripper's command at each frame
 
     def press(self, key: str, servo: Servo) -> None:
@@ -1651,15 +1720,15 @@ class Recorder:
             self.frames = None
 
     def observe(self) -> None:
-        """Adds what is seen now to the episode at hand."""
+        """Adds what is seen now to the episode that is being recorded."""
         if self.frames is not None:
             self.frames.append(self.cell.observe())
             self.grip.append(self.closed)
 
     def keep(self, servo: Servo) -> None:
-        """Writes the episode at hand behind the others, if `run` could execute it."""
+        """Writes the recorded episode behind the others, if `run` could execute it."""
         try:
-            actions = finish(self.frames, self.grip, self.cell.settings)
+            actions = episode_actions(self.frames, self.grip, self.cell.settings)
         except RobotError as error:
             print(f"dropped: {error}", flush=True)
             return
@@ -1735,11 +1804,11 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
 
 
 def check(args: argparse.Namespace, settings: Settings) -> None:
-    """Connects to everything, moves nothing, and says what it found."""
+    """Connects to everything, moves nothing, and says what is there."""
     asked = ("robotmode", "safetystatus", "programState", "is in remote control")
     try:
         answers = dashboard(args.host, settings.dashboard_port, *asked)
-    except RobotError as error:  # nothing but `check` needs it
+    except RobotError as error:  # the other commands do without it
         answers = {
             "dashboard": f"none ({error}): PolyScope X has none, elsewhere enable it",
             "is in remote control": "unknown: look at the panel",
@@ -1774,19 +1843,24 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
     for name, value in rows.items():
         print(f"{name:22}{value}")
     if args.picture:
-        sampled = points[:: math.ceil(len(points) / SAMPLED_FROM)]
-        frame = Frame(0.0, sampled, len(kept), np.append(state.pose, 0.0))
-        seen = to_recording(
-            [frame],
-            np.zeros((1, ACTION_DIM)),
-            task="check",
-            instruction="the robot's base frame",
-            meta={**meta, "positions_in_state": 1},
-        )
-        report.plot_demonstration(seen, args.picture)
+        thinned = points[:: math.ceil(len(points) / SAMPLED_FROM)]
+        frame = Frame(time=0.0, points=thinned, seen=len(kept), state=np.append(state.pose, 0.0))
+        plot_cell(args.picture, frame, meta)
         print(f"wrote {args.picture}")
     if trouble:
         raise RobotError(f"the arm cannot be moved: {trouble}")
+
+
+def plot_cell(path: str, frame: Frame, meta: dict) -> None:
+    """Draws a frame's points and TCP, and the boxes that `meta` names."""
+    recording = to_recording(
+        [frame],
+        np.zeros((1, ACTION_DIM)),
+        task="check",
+        instruction="the robot's base frame",
+        meta=meta,
+    )
+    report.plot_demonstration(recording, path)
 
 
 def record_camera(args: argparse.Namespace) -> None:
@@ -1814,36 +1888,48 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         description="Record, check and run on a UR10e. Keep a hand on the emergency stop."
     )
     commands = parser.add_subparsers(dest="command", required=True)
+    add = {}  # command -> the function that adds a flag to it
     for name, function in COMMANDS.items():
         text = function.__doc__
-        add = commands.add_parser(name, help=text.split("\n")[0], description=text).add_argument
-        add("--camera", metavar="FILE", help="replay a recorded camera instead of the RealSense")
-        if name == "camera":
-            add("--out", required=True, help="file to write, .npz")
-            add("--frames", type=int, default=30, help="how many images (default: 30)")
-            continue
-        add("--host", required=True, help="address of the robot; nothing else is contacted")
-        add("--config", default="robot.json", help="poses, boxes, limits (default: robot.json)")
-        if name == "check":
-            add("--picture", metavar="PNG", help="draw cloud, crop box and the TCP's box")
-            continue
-        add("--dry-run", action="store_true", help="everything but motion")
-        add("--out", help="file to write (default: demos/TASK.npz, runs/robot/TASK-TIME.npz)")
-        if name == "record":
-            add("--task", required=True, help="name of the task, and of the file")
-            add("--instruction", required=True, help="what to do, one sentence")
-            add("--episodes", type=int, default=10, help="how many to record (default: 10)")
-            add("--append", action="store_true", help="go on with a file that exists")
-            continue
-        add("--data", required=True, help="the task's demonstrations")
-        if name == "replay":
-            add("--episode", type=int, default=0, help="which, from 0 (default: 0)")
-            continue
-        add("--checkpoint", required=True, help="adapted policy of finetune.py")
-        add("--seconds", type=float, default=60, help="how long (default: 60)")
-        add("--seed", type=int, default=0, help="of noise and reference demonstration (default: 0)")
-        add("--device", default="cpu", help="where the policy computes: cpu, cuda (default: cpu)")
-        add("--clip-weights", help="ViT-B-32.pt, or `random` (default: as in the checkpoint)")
+        command = commands.add_parser(name, help=text.split("\n")[0], description=text)
+        add[name] = command.add_argument
+        add[name](
+            "--camera", metavar="FILE", help="replay a recorded camera instead of the RealSense"
+        )
+    for name in ("check", "record", "replay", "run"):
+        add[name]("--host", required=True, help="address of the robot; nothing else is contacted")
+        add[name](
+            "--config", default="robot.json", help="poses, boxes, limits (default: robot.json)"
+        )
+    for name in ("record", "replay", "run"):
+        add[name]("--dry-run", action="store_true", help="everything but motion")
+    for name in ("replay", "run"):
+        add[name]("--data", required=True, help="the task's demonstrations")
+        add[name]("--out", help="file to write (default: runs/robot/TASK-TIME-PROCESS.npz)")
+
+    flag = add["check"]
+    flag("--picture", metavar="PNG", help="draw cloud, crop box and the TCP's box")
+
+    flag = add["record"]
+    flag("--task", required=True, help="name of the task, and of the file")
+    flag("--instruction", required=True, help="what to do, one sentence")
+    flag("--episodes", type=int, default=10, help="how many to record (default: 10)")
+    flag("--append", action="store_true", help="go on with a file that exists")
+    flag("--out", help="file to write (default: demos/TASK.npz)")
+
+    flag = add["replay"]
+    flag("--episode", type=int, default=0, help="which, from 0 (default: 0)")
+
+    flag = add["run"]
+    flag("--checkpoint", required=True, help="adapted policy of finetune.py")
+    flag("--seconds", type=float, default=60, help="how long (default: 60)")
+    flag("--seed", type=int, default=0, help="of noise and reference demonstration (default: 0)")
+    flag("--device", default="cpu", help="where the policy computes: cpu, cuda (default: cpu)")
+    flag("--clip-weights", help="ViT-B-32.pt, or `random` (default: as in the checkpoint)")
+
+    flag = add["camera"]
+    flag("--out", required=True, help="file to write, .npz")
+    flag("--frames", type=int, default=30, help="how many images (default: 30)")
     return parser.parse_args(argv)
 
 

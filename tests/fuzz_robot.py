@@ -28,7 +28,8 @@ FAULTS = (
 def fuzz_robot(seed: int, rounds: int = 8) -> tuple[list[float], list[float], str | None]:
     """Faults come and go at random while a policy asks the emulated arm for more than it may.
 
-    Returns the highest speeds of the arm (m/s, rad/s), the limits, and why it was stopped.
+    Returns the highest speeds of the arm (m/s, rad/s), the limits, and why it was stopped. The
+    speeds are 0 where it was stopped before it moved, as on a machine that is too busy.
     """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=6)
@@ -82,7 +83,6 @@ def fuzz_robot(seed: int, rounds: int = 8) -> tuple[list[float], list[float], st
         time.sleep(0.3)  # whatever was held back goes on now
         servo.stop()
         rtde.close()
-        assert max(emulator.fastest) > 0, "the arm was never moved"
         return emulator.fastest, [settings.max_speed_m_s, settings.max_speed_rad_s], reason
 
 
@@ -227,18 +227,22 @@ def main(argv: list[str] | None = None) -> None:
         longest = max(longest, seconds - needed)
         assert seconds <= needed + 1, (seed, seconds, needed)
     print(f"{args.poses} poses reached, at most {longest:.2f} s later than their way needs")
-    highest, stopped = 0.0, 0
+    highest, moved, stopped = 0.0, 0, 0
     for seed in range(args.seed, args.seed + args.scripts):
         fastest, limits, reason = fuzz_robot(seed)
         shares = [speed / limit for speed, limit in zip(fastest, limits)]
-        highest, stopped = max(highest, *shares), stopped + (reason is not None)
+        highest = max(highest, *shares)
+        moved += max(shares) > 0
+        stopped += reason is not None
         shown = "{:.2f}, {:.2f} of the limits (m/s, rad/s)".format(*shares)
         print(f"{seed}: {shown}; stopped: {reason or 'never'}", flush=True)
         assert max(shares) <= 1, (seed, fastest, limits)
     if args.scripts:
         print(
-            f"{args.scripts} scripts: at most {highest:.3f} of a limit, {stopped} stopped the arm"
+            f"{args.scripts} scripts: {moved} moved the arm, at most at {highest:.3f} of a limit, "
+            f"and {stopped} stopped it"
         )
+        assert moved >= 0.9 * args.scripts, "the arm was hardly ever moved: is the machine busy?"
 
 
 if __name__ == "__main__":
