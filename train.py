@@ -171,7 +171,7 @@ HIDDEN_GOALS = {
     "evaluate_on": "novel",
     "episodes": 5,
 }
-SUITE_SETTINGS = {f"goals-{skill}": HIDDEN_GOALS for skill in ("reach", "push", "pick-place")}
+SUITE_SETTINGS = {suite: HIDDEN_GOALS for suite in SIMULATORS if suite.startswith("goals-")}
 
 
 # ---- Algorithm 1 ---------------------------------------------------------------------------------
