@@ -158,13 +158,14 @@ SETTINGS = {
 
 
 # What a suite of hidden goals changes, in every preset. All goals have the same instruction, so the
-# demonstration is read without leaving that out; moving each scene by a map of its own would hide
-# the goal; and on novel goals a policy is measured without adapting it.
+# demonstration is read without leaving that out; a map of each scene's own would hide the goal, one
+# map for all scenes of a task makes new goals; and on novel goals a policy is measured unadapted.
 HIDDEN_GOALS = {
     "base_tasks": 160,
     "demonstrations": 3,  # one to read, one for the support windows, one for the query windows
     "tasks_per_step": 16,
-    "augment": False,
+    "augment": True,
+    "one_map": True,
     "instruction_dropout": 0.0,
     "after_success": None,
     "late_fraction": 0.0,
