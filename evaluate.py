@@ -312,7 +312,7 @@ def checkpoints_of(path: str | Path) -> list[Path]:
 
 
 def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
-    """The last checkpoint of the newest finished run on `suite`; without any, the one that ships.
+    """The last checkpoint of the newest finished run on `suite`; without any, one that ships.
 
     Runs of `tiny` do not count: they show that everything works, and succeed nearly nowhere.
     Raises UserError where there is neither.
@@ -327,7 +327,8 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
                 runs_of_preset.append(last)
     if finished:
         return max(finished, key=lambda path: path.stat().st_mtime)
-    if suite != "ml10" or not SHIPPED_CHECKPOINT.is_file():
+    shipped = SHIPPED_CHECKPOINT.with_name(f"{suite}-small.pt")
+    if not shipped.is_file():
         if tiny:
             run = max(tiny, key=lambda path: path.stat().st_mtime).parent
             raise UserError(
@@ -336,7 +337,7 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
             )
         raise UserError(f"no finished run on {suite} in {runs}/: train one, or name a --checkpoint")
     print(f"no finished run in {runs}/: using the policy that comes with the code", flush=True)
-    return SHIPPED_CHECKPOINT
+    return shipped
 
 
 def load_trained(

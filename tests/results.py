@@ -3,7 +3,7 @@
     python -m tests.results runs/ml10-dami-seed0   # takes a run of tests.runs into RESULTS.json
     python -m tests.results                        # writes the tables, draws the charts
     python -m tests.results --compare ml10-dami ml10-neither    # episodes won and lost, sign test
-    python -m tests.results --ship CHECKPOINT      # makes it assets/ml10-small.pt, float16
+    python -m tests.results --ship CHECKPOINT      # makes it assets/SUITE-small.pt, float16
 
 RESULTS.json holds for each run how it was trained and, for each report that measured it, every
 episode (1: success, 0: not) with the command, hardware, seed and date.
@@ -39,7 +39,7 @@ from report import (
     wilson_interval,
 )
 from simulator import simulator_of
-from tests.runs import AGAIN, REPORTS
+from tests.runs import AGAIN, HIDDEN_REPORTS, REPORTS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "assets" / "RESULTS.json"
@@ -139,6 +139,7 @@ class Column:
 
     report: str
     column: int | str = 0
+    at_end: bool = False  # success at the end, not at any step
 
 
 BASE, BEFORE, AFTER = Column("base"), Column("novel", "before"), Column("novel", "after")
@@ -151,7 +152,13 @@ Results = dict[str, dict[str, Any]]  # a run's name -> "training", and its repor
 
 
 def take(results: Results, run: Path) -> None:
-    """Adds a run's training and the reports beside its folder to `results`."""
+    """Adds a run's training and the reports beside its folder to `results`.
+
+    A folder of `tests.controls`, which trains nothing, is its own report.
+    """
+    if (run / "success.json").exists() and not (run / "metrics.jsonl").exists():
+        results[run.name] = {"novel": read_report(run)}
+        return
     steps = [line for line in read_json_lines(run / "metrics.jsonl") if "loss" in line]
     training = {
         "minutes": round(steps[-1]["seconds"] / 60, 1),
@@ -164,18 +171,22 @@ def take(results: Results, run: Path) -> None:
             "after": round(float(np.mean([line["loss"] for line in inner_steps])), 5),
         }
     results[run.name] = {"training": training}
-    for name in REPORTS:
-        path = Path(f"{run}-{name}") / "success.json"
-        if not path.exists():
-            continue
-        report = json.loads(path.read_text())
-        for part in ("successes", "successes at the end", "checkpoints"):
-            if part in report:
-                report[part] = {
-                    title: {task: as_digits(episodes) for task, episodes in column.items()}
-                    for title, column in report[part].items()
-                }
-        results[run.name][name] = report
+    for name in (*REPORTS, *HIDDEN_REPORTS):
+        folder = Path(f"{run}-{name}")
+        if (folder / "success.json").exists():
+            results[run.name][name] = read_report(folder)
+
+
+def read_report(folder: Path) -> dict[str, Any]:
+    """A report as RESULTS.json keeps it, with the episodes as digits."""
+    report = json.loads((folder / "success.json").read_text())
+    for part in ("successes", "successes at the end", "checkpoints"):
+        if part in report:
+            report[part] = {
+                title: {task: as_digits(episodes) for task, episodes in column.items()}
+                for title, column in report[part].items()
+            }
+    return report
 
 
 def as_digits(episodes: Sequence[bool]) -> str:
@@ -193,7 +204,8 @@ def runs_of(results: Results, variant: str) -> list[dict]:
 
 def measured(run: dict, column: Column) -> Successes | None:
     """The episodes in a column of a run's report, if there is one."""
-    columns = run.get(column.report, {}).get("successes", {})
+    part = "successes at the end" if column.at_end else "successes"
+    columns = run.get(column.report, {}).get(part, {})
     title = column.column
     if isinstance(title, int):
         if not columns:
@@ -450,6 +462,41 @@ def looks_table(results: Results) -> str:
     return format_table(rows)
 
 
+# What is measured on goals that no observation tells: a title, the variant, and its report.
+HIDDEN_ROWS = (
+    ("its own demonstration", "demonstration", Column("novel", 0)),
+    ("another goal's", "demonstration", Column("novel", 2)),
+    ("zeros in its place", "demonstration", Column("novel", 1)),
+    ("its last frame alone", "demonstration", Column("parts", 1)),
+    ("without its actions", "demonstration", Column("parts", 2)),
+    ("its frames in another order", "demonstration", Column("parts", 3)),
+    ("trained without demonstration, no step", "neither", Column("0-steps")),
+    ("the same, one inner step", "neither", Column("1-step")),
+    ("the same, five inner steps", "neither", Column("5-steps")),
+    ("trained through an inner step, before it", "inner", Column("0-steps")),
+    ("the same, one inner step", "inner", Column("1-step")),
+    ("the same, five inner steps", "inner", Column("5-steps")),
+    ("in first order, one inner step", "inner-first-order", Column("1-step")),
+    ("in first order, five inner steps", "inner-first-order", Column("5-steps")),
+    ("both, no step", "both", Column("novel", 0)),
+    ("both, one inner step", "both", Column("1-step")),
+    ("no network: the demonstration's actions again", "controls", Column("novel", "replay")),
+    ("no network: to the hand's last position", "controls", Column("novel", "servo")),
+    ("the expert, who knows the goal", "controls", Column("novel", "expert")),
+)
+
+
+def hidden_goals_table(results: Results, skill: str) -> str:
+    """A row for everything that was measured on the novel goals of a skill."""
+    rows = [[f"{skill}, goals never seen", "at any step", "at the end"]]
+    for title, variant, column in HIDDEN_ROWS:
+        name = f"goals-{skill}-{variant}"
+        cells = [mean(results, name, replace(column, at_end=at_end)) for at_end in (False, True)]
+        if any(cells):
+            rows.append([title, *cells])
+    return format_table(rows)
+
+
 TABLES: dict[str, Callable[[Results], str]] = {
     "means": means_table,
     "base": lambda results: by_task_table(results, "base"),
@@ -465,6 +512,8 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),
     "ml45 novel": lambda results: by_task_table(results, "novel", "ml45"),
     "looks": looks_table,
+    "goals reach": lambda results: hidden_goals_table(results, "reach"),
+    "goals push": lambda results: hidden_goals_table(results, "push"),
     "swap": swap_table,
     "reading": reading_table,
 }
@@ -608,13 +657,14 @@ def compare(results: Results, one: str, other: str) -> str:
 
 
 def ship(checkpoint: str) -> None:
-    """Writes assets/ml10-small.pt: a checkpoint in float16 that is rolled out as `small` is."""
+    """Writes assets/SUITE-small.pt: a checkpoint in float16 that is rolled out as `small` is."""
     small = model.PRESETS["small"]
     policy, info = load_trained(
         checkpoint, n_action_steps=small.n_action_steps, inference_steps=small.inference_steps
     )
-    kept = {name: info[name] for name in TRAINED}
-    model.save(SHIPPED_CHECKPOINT, policy, half=True, **kept)
+    kept = {name: info[name] for name in (*TRAINED, "inner_rates") if name in info}
+    path = SHIPPED_CHECKPOINT.with_name(f"{info['suite']}-small.pt")  # where scripts look for it
+    model.save(path, policy, half=True, **kept)
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -622,7 +672,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("runs", nargs="*", help="folders of tests.runs to take into RESULTS.json")
     add("--compare", nargs=2, metavar="VARIANT", help="episodes that the first wins and loses")
-    add("--ship", metavar="CHECKPOINT", help="make it assets/ml10-small.pt")
+    add("--ship", metavar="CHECKPOINT", help="make it assets/SUITE-small.pt")
     return parser.parse_args(argv)
 
 

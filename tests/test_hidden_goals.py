@@ -118,6 +118,21 @@ def test_two_goals_from_one_start_are_equal_clouds_and_another_start_is_not(envi
     assert np.abs(begun["agent_pos"] - first.observe()["agent_pos"]).max() > 0.01
 
 
+@pytest.mark.parametrize("skill", SKILLS)
+def test_what_is_seen_and_moves_does_not_depend_on_the_goal(environments, skill):
+    """So another goal's demonstration leads to that goal as often as its own does, by definition:
+    the same episode is judged by another goal."""
+    actions = np.random.default_rng(0).uniform(-1, 1, (12, 4))
+    observations = []
+    for env in environments[skill]:
+        env.begin(7)
+        for action in actions:
+            env.advance(action)
+        observations.append(env.observe())
+    for name, x in observations[0].items():
+        assert np.array_equal(x, observations[1][name])
+
+
 def test_the_cloud_lacks_the_marker_and_nothing_else(environments):
     """With the goal beside the hand, where both are seen, the marker's points alone are missing."""
     env, _ = environments["reach"]
