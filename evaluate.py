@@ -397,6 +397,7 @@ def evaluate_checkpoint(
     n_demonstrations: int | None = None,
     demonstration_control: str | None = None,
     inner_steps: int = 0,
+    support: int | None = None,
     known_goals: bool = False,
     stop_at_success: bool = False,
     config_overrides: dict[str, Any] | None = None,
@@ -417,7 +418,8 @@ def evaluate_checkpoint(
         demonstration_control: what the policy reads in place of its demonstration, a key of
             DEMONSTRATION_CONTROLS; None: the demonstration.
         inner_steps: the policy is adapted to each task by so many steps before, with the inner rate
-            and on as many windows as in its training; see `take_inner_steps`.
+            of its training; see `take_inner_steps`.
+        support: windows for these steps; None: as many as in its training.
         known_goals: roll out on the demonstrations' goals, at most `episodes` of them, each once.
         stop_at_success: an episode ends at its first success; it is quicker.
         config_overrides: of the policy's configuration, see `inference_overrides`.
@@ -443,6 +445,7 @@ def evaluate_checkpoint(
                     "seeds": seeds[start : start + EPISODES_A_JOB],
                     "demonstration_control": demonstration_control,
                     "inner_steps": inner_steps,
+                    "support": support,
                     "stop_at_success": stop_at_success,
                 }
             )
@@ -481,6 +484,7 @@ def rollout_job(
     seeds: list[int],
     demonstration_control: str | None,
     inner_steps: int,
+    support: int | None,
     stop_at_success: bool,
 ) -> list[list[bool]]:
     """`rollout` of the episodes of these seeds, of one task, in a worker process."""
@@ -502,7 +506,7 @@ def rollout_job(
             worker_state["sampler"],
             torch.from_numpy(text).to(device),
             steps=inner_steps,
-            batch=info["arguments"]["support"],
+            batch=support or info["arguments"]["support"],
             lr=inner_rate(info, device),
         )
     successes = rollout(
@@ -881,6 +885,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         default=0,
         help="adapt to each task by so many inner steps, as in training, before (default: 0)",
     )
+    add("--support", type=int, help="windows for these steps (default: as many as in training)")
     add_inference_flags(parser)
     common.add_common_flags(parser)
     return parser.parse_args(argv)
@@ -893,6 +898,7 @@ def check_flags(args: argparse.Namespace) -> None:
         ("episodes", args.episodes, 1),
         ("top", args.top, 0),
         ("inner-steps", args.inner_steps, 0),
+        ("support", args.support, 1),
     ):
         if value is not None and value < least:
             raise UserError(f"--{name} is {value}: use at least {least}")
@@ -1143,6 +1149,7 @@ def measure(
             n_demonstrations=args.demonstrations,
             demonstration_control=measurement.demonstration_control,
             inner_steps=args.inner_steps,
+            support=args.support,
             known_goals=args.known_goals,
             stop_at_success=args.stop_at_success,
             config_overrides=inference_overrides(args),
@@ -1157,6 +1164,7 @@ def measure(
         "goals": "of the demonstrations, each once" if args.known_goals else "new",
         "left out": " and ".join(args.without) or "nothing",
         "inner steps": args.inner_steps,
+        "support": args.support or "as in training",
         "text weights": identity,
         **common.provenance("evaluate.py", argv, device),
         **inference_overrides(args),

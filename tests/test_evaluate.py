@@ -338,6 +338,7 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
             seeds=[simulator.evaluation_seed(0, episode)],
             demonstration_control=None,
             inner_steps=0,
+            support=None,
             stop_at_success=True,
         )
         return np.stack(frames)
@@ -626,6 +627,7 @@ def test_what_the_command_line_says_reaches_the_rollouts(run, recordings, traine
         "n_demonstrations": 2,
         "demonstration_control": None,
         "inner_steps": 0,
+        "support": None,
         "known_goals": True,
         "stop_at_success": True,
         "config_overrides": {"sampler": "ddim"},
