@@ -171,7 +171,29 @@ HIDDEN_GOALS = {
     "evaluate_on": "novel",
     "episodes": 5,
 }
-SUITE_SETTINGS = {f"goals-{skill}": HIDDEN_GOALS for skill in ("reach", "push", "pick-place")}
+
+# What pairs change. The instruction does not tell the task, so leaving it out teaches nothing.
+PAIRS = {"instruction_dropout": 0.0, "after_success": None, "late_fraction": 0.0}
+
+# What turned actions change. Augmentation also stretches scenes, and so would change the angle.
+CONVENTION = {
+    "demonstrations": 8,
+    "tasks_per_step": 16,  # all
+    "augment": False,
+    "instruction_dropout": 0.0,
+    "after_success": None,
+    "late_fraction": 0.0,
+    "evaluate_on": "novel",
+    "episodes": 5,
+}
+SUITE_SETTINGS = {
+    "goals-reach": HIDDEN_GOALS,
+    "goals-push": HIDDEN_GOALS,
+    "goals-pick-place": HIDDEN_GOALS,
+    "pairs": PAIRS,
+    "convention-reach": CONVENTION,
+    "convention-push": CONVENTION,
+}
 
 
 # ---- Algorithm 1 ---------------------------------------------------------------------------------
@@ -745,7 +767,12 @@ def report_training(
 
     files = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     print(f"\n{folder} is finished: {', '.join(files)}")
-    new = "--data NEW.npz" if settings.suite == "own" else f"--task novel --suite {settings.suite}"
+    if settings.suite == "own":
+        new = "--data NEW.npz"
+    elif simulator_of(settings.suite).tasks(settings.suite)[1]:
+        new = f"--task novel --suite {settings.suite}"
+    else:
+        return  # there are no novel tasks to adapt to
     print(f"next: python finetune.py {new} --checkpoint {shlex.quote(str(folder))}")
 
 
@@ -1088,6 +1115,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         data = Path(args.data or "data")
         paths = {task: data / f"{task}.npz" for task in draw_base_tasks(base_tasks, settings)}
         novel_paths = {}  # if they are evaluated on
+        if settings.evaluate_on == "novel" and not novel_tasks:
+            raise UserError(f"--evaluate-on novel: {suite} has no novel tasks")
         if settings.evaluate_on == "novel" and settings.episodes > 0:
             novel_paths = {task: data / f"{task}.npz" for task in novel_tasks}
     name = preset if config.policy == "dami" else f"{config.policy}-{preset}"
