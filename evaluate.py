@@ -853,7 +853,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add(
         "--demonstrations",
         type=int,
-        help="demonstrations a task (default: 10; 5 where goals are hidden)",
+        help="demonstrations a task (default: 10 or 5, as the suite says)",
     )
     add("--episodes", type=int, default=20, help="episodes a task (default: 20)")
     add("--top", type=int, default=0, help="all checkpoints of a run, and the mean of the best TOP")
@@ -962,6 +962,8 @@ def choose_tasks(
             check_task(simulator, task)
         return tasks
     base, novel = simulator.tasks(suite)
+    if args.split == "novel" and not novel:
+        raise UserError(f"--split novel: {suite} has no novel tasks")
     return {"base": base, "novel": novel, "all": [*base, *novel]}[args.split]
 
 

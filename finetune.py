@@ -421,6 +421,8 @@ def choose_tasks(names: Sequence[str], simulator: Simulator, suite: str) -> list
     """The tasks of a simulator that --task names."""
     if list(names) == ["novel"]:
         _, novel = simulator.tasks(suite)
+        if not novel:
+            raise UserError(f"--task novel: {suite} has no novel tasks")
         return novel
     return [check_task(simulator, name) for name in names]
 

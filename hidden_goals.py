@@ -114,12 +114,7 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         self.sawyer_env.goal_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
         self.sawyer_env.__dict__.pop("sawyer_observation_space", None)
 
-        # The camera does not see what is transparent when it is made.
-        marker = self.sawyer_env.model.site("goal")
-        color = marker.rgba.copy()
-        marker.rgba[3] = 0
-        self.camera = self.make_camera(CAMERA_PIXELS)
-        marker.rgba[:] = color
+        self.camera = self.make_camera(CAMERA_PIXELS, hidden_sites=("goal",))
 
     @cached_property
     def picture_camera(self) -> RayCastCamera:

@@ -10,6 +10,7 @@ Letters: N points of an observation.
 """
 
 import warnings
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -169,13 +170,21 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         )
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
 
-    def make_camera(self, pixels: int) -> RayCastCamera:
-        """Makes a camera of `pixels` rows and columns that sees the workspace."""
+    def make_camera(self, pixels: int, hidden_sites: Collection[str] = ()) -> RayCastCamera:
+        """Makes a camera of `pixels` rows and columns that sees the workspace.
+
+        It does not see the sites of these names, such as goal markers; others still do.
+        """
         model = self.sawyer_env.model
         # The floor, the table and its walls: bodies with a geom as wide as the workspace.
         (low, *_), (high, *_) = WORKSPACE
         wide = 2 * model.geom_size[:, 0] >= high - low
-        return RayCastCamera(
+
+        # The camera does not see what is transparent when it is made.
+        colors = model.site_rgba.copy()
+        hidden = [site for site in range(model.nsite) if model.site(site).name in hidden_sites]
+        model.site_rgba[hidden, 3] = 0
+        camera = RayCastCamera(
             model,
             CAMERA,
             height=pixels,
@@ -184,6 +193,8 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
             background=np.unique(model.geom_bodyid[wide]),
             ellipsoids=ARM_LINKS,
         )
+        model.site_rgba[:] = colors
+        return camera
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """Begins an episode; without a seed one is drawn. Returns (observation, info)."""

@@ -104,6 +104,16 @@ def hidden_goals() -> Simulator:
     return import_simulator("hidden_goals").HiddenGoals()
 
 
+def pairs() -> Simulator:
+    """Returns Meta-World's pairs of tasks in one scene, which are imported only here."""
+    return import_simulator("unnamed_tasks").Pairs()
+
+
+def conventions() -> Simulator:
+    """Returns Meta-World's skills with turned actions, which are imported only here."""
+    return import_simulator("unnamed_tasks").Conventions()
+
+
 SIMULATORS: dict[str, Callable[[], Simulator]] = {
     "ml10": meta_world,
     "ml45": meta_world,
@@ -113,6 +123,11 @@ SIMULATORS: dict[str, Callable[[], Simulator]] = {
     "goals-reach-validation": hidden_goals,
     "goals-push-validation": hidden_goals,
     "goals-pick-place-validation": hidden_goals,
+    "pairs": pairs,
+    "convention-reach": conventions,
+    "convention-push": conventions,
+    "convention-reach-validation": conventions,
+    "convention-push-validation": conventions,
 }
 
 
@@ -381,7 +396,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--task", help="only this task")
     parser.add_argument("--data", default="data", help="folder of the files (data)")
     parser.add_argument(
-        "--episodes", type=int, help="successful ones a task (10; 5 where goals are hidden)"
+        "--episodes", type=int, help="successful ones a task (10 or 5, as the suite says)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of objects and goals, 0 to 999 (0)")
     parser.add_argument("--workers", type=int, help="processes (one a core)")

@@ -172,7 +172,35 @@ HIDDEN_GOALS = {
     "evaluate_on": "novel",
     "episodes": 5,
 }
-SUITE_SETTINGS = {suite: HIDDEN_GOALS for suite in SIMULATORS if suite.startswith("goals-")}
+
+# What pairs change. The instruction does not tell the task, so leaving it out teaches nothing.
+PAIRS = {"instruction_dropout": 0.0, "after_success": None, "late_fraction": 0.0}
+
+# What turned actions change. Augmentation also stretches scenes, and so would change the angle.
+CONVENTION = {
+    "demonstrations": 8,
+    "tasks_per_step": 16,  # all
+    "augment": False,
+    "instruction_dropout": 0.0,
+    "after_success": None,
+    "late_fraction": 0.0,
+    "evaluate_on": "novel",
+    "episodes": 5,
+}
+SUITE_SETTINGS = {
+    "goals-reach": HIDDEN_GOALS,
+    "goals-push": HIDDEN_GOALS,
+    "goals-pick-place": HIDDEN_GOALS,
+    "pairs": PAIRS,
+    "convention-reach": CONVENTION,
+    "convention-push": CONVENTION,
+}
+
+
+def preset_settings(preset: str, suite: str) -> Settings:
+    """A preset's settings on a suite; those of a suite's validation are the suite's own."""
+    changes = SUITE_SETTINGS.get(suite.removesuffix("-validation"), {})
+    return replace(SETTINGS[preset], suite=suite, **changes)
 
 
 # ---- Algorithm 1 ---------------------------------------------------------------------------------
@@ -791,7 +819,12 @@ def report_training(
 
     files = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     print(f"\n{folder} is finished: {', '.join(files)}")
-    new = "--data NEW.npz" if settings.suite == "own" else f"--task novel --suite {settings.suite}"
+    if settings.suite == "own":
+        new = "--data NEW.npz"
+    elif simulator_of(settings.suite).tasks(settings.suite)[1]:
+        new = f"--task novel --suite {settings.suite}"
+    else:
+        return  # there are no novel tasks to adapt to
     print(f"next: python finetune.py {new} --checkpoint {shlex.quote(str(folder))}")
 
 
@@ -885,7 +918,7 @@ def choose_settings(
     args: argparse.Namespace, preset: str, suite: str, config: PolicyConfig
 ) -> Settings:
     """The preset's settings, with the flags that were given."""
-    settings = replace(SETTINGS[preset], suite=suite, **SUITE_SETTINGS.get(suite, {}))
+    settings = preset_settings(preset, suite)
     if suite == "own":  # all demonstrations, and no simulator to be rolled out in
         settings = replace(settings, demonstrations=None, episodes=0)
     if not build_empty(config).reads_demonstration:  # then the instruction alone tells the task
@@ -956,7 +989,7 @@ def begin_log(
         default = baselines.PRESETS[config.policy][settings.preset]
         common.print_settings(
             used={**asdict(settings), **asdict(config)},
-            default={**asdict(SETTINGS[settings.preset]), **asdict(default)},
+            default={**asdict(preset_settings(settings.preset, settings.suite)), **asdict(default)},
         )
     else:
         print(f"going on after step {step} of {settings.steps}", flush=True)
@@ -1140,6 +1173,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         data = Path(args.data or "data")
         paths = {task: data / f"{task}.npz" for task in draw_base_tasks(base_tasks, settings)}
         novel_paths = {}  # if they are evaluated on
+        if settings.evaluate_on == "novel" and not novel_tasks:
+            raise UserError(f"--evaluate-on novel: {suite} has no novel tasks")
         if settings.evaluate_on == "novel" and settings.episodes > 0:
             novel_paths = {task: data / f"{task}.npz" for task in novel_tasks}
     name = preset if config.policy == "dami" else f"{config.policy}-{preset}"

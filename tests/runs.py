@@ -18,14 +18,14 @@ import sys
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
 
 from common import choose, command_line
 from tests.oracle import WORLDS
-from train import SETTINGS, SUITE_SETTINGS
+from train import preset_settings
 
 NEITHER = "--demo-encoder none --maml off"  # multi-task training
 METHOD = {  # a variant of the method -> its flags of train.py
@@ -166,8 +166,7 @@ class Job:
 def steps_of(suite: str, flags: str) -> int:
     """How many outer steps a training with these flags takes."""
     given = re.findall(r"--steps (\d+)", flags)
-    preset = replace(SETTINGS["small"], **SUITE_SETTINGS.get(suite, {}))
-    return int(given[-1]) if given else preset.steps
+    return int(given[-1]) if given else preset_settings("small", suite).steps
 
 
 def jobs_of_run(variant: str, seed: int, *, suite: str, flags: str, episodes: int) -> list[Job]:
