@@ -170,7 +170,18 @@ HIDDEN_GOALS = {
     "after_success": None,
     "late_fraction": 0.0,
     "evaluate_on": "novel",
-    "episodes": 5,
+    "episodes": 2,
+}
+# And what it changes in `small` besides: many goals a step, and few windows of each.
+HIDDEN_GOALS_SMALL = {
+    "steps": 1_000,
+    "tasks_per_step": 24,
+    "support": 2,
+    "query": 2,
+    "pretrain_fraction": 0.95,
+    "vectorize": 12,
+    "checkpoint_every": 500,
+    "evaluate_every": 1_000,
 }
 
 # What pairs change. The instruction does not tell the task, so leaving it out teaches nothing.
@@ -199,7 +210,9 @@ SUITE_SETTINGS = {
 
 def preset_settings(preset: str, suite: str) -> Settings:
     """A preset's settings on a suite; those of a suite's validation are the suite's own."""
-    changes = SUITE_SETTINGS.get(suite.removesuffix("-validation"), {})
+    changes = dict(SUITE_SETTINGS.get(suite.removesuffix("-validation"), {}))
+    if preset == "small" and suite.startswith("goals-"):
+        changes.update(HIDDEN_GOALS_SMALL)
     return replace(SETTINGS[preset], suite=suite, **changes)
 
 

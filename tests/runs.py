@@ -110,13 +110,17 @@ for name, flags in CURVE.items():
 
 
 # Where goals are hidden: who reads a demonstration, and who is adapted by an inner step.
-INNER = "--learn-inner-lr --inner-lr 3e-2 --pretrain-fraction 0.3"
+MANY_GOALS = "--tasks-per-step 40 --support 1 --query 1 --steps 1500"
+INNER = (
+    "--tasks-per-step 10 --support 8 --query 4 --vectorize 10 --steps 450 --pretrain-fraction 0.3 "
+    "--learn-inner-lr --inner-lr 3e-2"
+)
 HIDDEN_METHOD = {
-    "demonstration": "--maml off",
-    "neither": NEITHER,
+    "demonstration": f"--maml off {MANY_GOALS}",
+    "neither": f"{NEITHER} {MANY_GOALS}",
     "inner": f"--demo-encoder none {INNER}",
     "inner-first-order": f"--demo-encoder none --maml first {INNER}",
-    "both": INNER,
+    "both": "",
 }
 ADAPTED = ("neither", "inner", "inner-first-order", "both")
 NOVEL = "evaluate.py --split novel --checkpoint {run}"
