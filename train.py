@@ -167,6 +167,7 @@ HIDDEN_GOALS = {
     "augment": True,
     "one_map": True,
     "instruction_dropout": 0.0,
+    "task_dropout": 0.0,
     "after_success": None,
     "late_fraction": 0.0,
     "evaluate_on": "novel",
@@ -174,14 +175,13 @@ HIDDEN_GOALS = {
 }
 # And what it changes in `small` besides: many goals a step, and few windows of each.
 HIDDEN_GOALS_SMALL = {
-    "steps": 1_000,
-    "tasks_per_step": 24,
-    "support": 2,
-    "query": 2,
-    "pretrain_fraction": 0.95,
-    "vectorize": 12,
+    "steps": 1_500,
+    "tasks_per_step": 40,
+    "support": 1,
+    "query": 1,
+    "pretrain_fraction": 0.97,
     "checkpoint_every": 500,
-    "evaluate_every": 1_000,
+    "evaluate_every": 1_500,
 }
 
 # What pairs change. The instruction does not tell the task, so leaving it out teaches nothing.

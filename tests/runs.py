@@ -110,14 +110,13 @@ for name, flags in CURVE.items():
 
 
 # Where goals are hidden: who reads a demonstration, and who is adapted by an inner step.
-MANY_GOALS = "--tasks-per-step 40 --support 1 --query 1 --steps 1500"
 FEW_GOALS = "--demo-encoder none --tasks-per-step 10 --support 8 --query 4 --no-augment"
 INNER = (
     f"{FEW_GOALS} --steps 450 --pretrain-fraction 0.3 --vectorize 10 "
     "--learn-inner-lr --inner-lr 3e-2"
 )
 HIDDEN_METHOD = {
-    "demonstration": f"--maml off {MANY_GOALS}",
+    "demonstration": "--maml off",
     "neither": f"{FEW_GOALS} --maml off --steps 1700 --inner-lr 3e-2",  # as long as "inner"
     "inner": INNER,
     "inner-first-order": f"{INNER} --maml first",
