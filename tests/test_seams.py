@@ -21,7 +21,7 @@ import model
 import report
 import simulator
 import train
-from data import load_demonstrations, save_demonstrations
+from data import WindowSampler, load_demonstrations, save_demonstrations
 
 CPU = "--device cpu --threads 1"
 QUICK = f"--episodes 0 {CPU}"  # no rollouts
@@ -192,3 +192,54 @@ def check_colors(trained, adapted):
         features = [policy.encode_observations(points, state) for points in (red, green)]
         assert not torch.allclose(*features, atol=1e-3)
     assert (fitted[0] != fitted[1]).all()  # in finetuning, positions are fitted again
+
+
+def test_training_where_no_observation_tells_the_task_ends_with_what_tells_it(
+    here, own_folder, monkeypatch, capsys
+):
+    """Own, another's and no demonstration, each also after an inner step; and an animation."""
+    films = []
+    monkeypatch.setattr(evaluate, "animate", lambda of_tasks, *_: films.append(list(of_tasks)))
+    measured = []
+    original = evaluate.rollout_job
+
+    def watched(**arguments):
+        measured.append((arguments["demonstration_control"], arguments["inner_steps"]))
+        return original(**arguments)
+
+    monkeypatch.setattr(evaluate, "rollout_job", watched)
+    training = "--suite toy --preset tiny --steps 2 --demonstrations 3 --base-tasks 1"
+    call(train, f"{training} --evaluate-on novel --episodes 1 --out run {CPU}")
+    titles = ["own demonstration", "another task's", "none"]
+    expected = [*titles, *(f"{title}, after an inner step" for title in titles)]
+    assert lengths("run") == {title: {"touch-blue": 1} for title in expected}
+    assert measured == [(control, steps) for steps in (0, 1) for control in (None, None, "zeros")]
+    assert films == [["touch-blue"]]
+    printed = capsys.readouterr().out
+    assert all(f"| {title} " in printed for title in expected)
+    assert len(load_demonstrations("data/touch-blue.npz")) == ToySimulator.demonstrations
+
+    measured.clear()
+    call(train, f"{training} --evaluate-on novel --episodes 1 --maml off --out off {CPU}")
+    assert list(lengths("off")) == titles and len(measured) == 3
+    call(train, f"{training} --evaluate-on novel --episodes 1 --demo-encoder none --out no {CPU}")
+    assert list(lengths("no")) == ["no demonstration", "no demonstration, after an inner step"]
+
+
+def test_inner_steps_before_a_rollout_change_the_policy_by_its_own_rate(here, own_folder):
+    call(simulator, "--suite toy --episodes 2")
+    call(train, f"--suite toy --preset tiny --steps 2 --inner-lr 0.01 --out run {QUICK}")
+    policy, info = model.load("run/ema-00002.pt")
+    sampler = WindowSampler(load_demonstrations("data/touch-blue.npz"), policy.config)
+    text = torch.zeros(512)
+    steps = evaluate.take_inner_steps(
+        policy, sampler, text, steps=2, batch=4, lr=evaluate.inner_rate(info, "cpu")
+    )
+    (_, first_loss, _), (_, second_loss, adapted) = steps
+    assert second_loss < first_loss
+    assert not torch.equal(adapted.denoiser.head[1].bias, policy.denoiser.head[1].bias)
+    learned = {**info, "inner_rates": {name: 0.0 for name, _ in policy.named_parameters()}}
+    *_, (_, _, still) = evaluate.take_inner_steps(
+        policy, sampler, text, steps=2, batch=4, lr=evaluate.inner_rate(learned, "cpu")
+    )
+    assert all(torch.equal(a, b) for a, b in zip(still.parameters(), policy.parameters()))
