@@ -103,7 +103,9 @@ class Settings:
     )
     late_fraction: float = setting(0.0, "fraction of late windows", least=0, most=1)
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
-    one_map: bool = setting(False, "of a task's scenes all alike, where a place tells the task")
+    one_map: bool = setting(
+        False, "augment all scenes of a task by one map, where a place tells the task"
+    )
     instruction_dropout: float = setting(
         0.0, "fraction of the batches without instruction", least=0, most=1
     )
@@ -157,9 +159,10 @@ SETTINGS = {
 # fmt: on
 
 
-# What a suite of hidden goals changes, in every preset. All goals have the same instruction, so the
-# demonstration is read without leaving that out; a map of each scene's own would hide the goal, one
-# map for all scenes of a task makes new goals; and on novel goals a policy is measured unadapted.
+# What a suite of hidden goals changes, in every preset. The instruction tells nothing here, so that
+# it need not be left out for the demonstration to be read. One map moves all scenes of a task, which
+# makes new goals; a map of each scene's own would hide the goal. What was learned is measured on
+# novel goals, without adapting to them.
 HIDDEN_GOALS = {
     "base_tasks": 160,
     "demonstrations": 3,  # one to read, one for the support windows, one for the query windows
@@ -173,7 +176,7 @@ HIDDEN_GOALS = {
     "evaluate_on": "novel",
     "episodes": 2,
 }
-# And what it changes in `small` besides: many goals a step, and few windows of each.
+# What it changes besides in `small`: many goals a step, and few windows of each.
 HIDDEN_GOALS_SMALL = {
     "steps": 1_500,
     "tasks_per_step": 40,
@@ -682,15 +685,17 @@ class Evaluation:
                 "none": {"demonstration_control": "zeros"},
             }
         columns = {}
-        with stop.suspended():
-            for title, options in inputs.items():
-                measured = own if not options else self.roll_out(checkpoint, **options)
-                columns[title] = measured
-            if settings.pretrain_steps < settings.steps:
+        try:
+            with stop.suspended():
                 for title, options in inputs.items():
-                    measured = self.roll_out(checkpoint, **options, inner_steps=1)
-                    columns[f"{title}, after an inner step"] = measured
-            self.animate(checkpoint)
+                    columns[title] = self.roll_out(checkpoint, **options) if options else own
+                if settings.pretrain_steps < settings.steps:
+                    for title, options in inputs.items():
+                        after = self.roll_out(checkpoint, **options, inner_steps=1)
+                        columns[f"{title}, after an inner step"] = after
+                self.animate(checkpoint)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("all is saved, add --resume to go on") from None
         return columns
 
     def animate(self, checkpoint: Path) -> None:
