@@ -159,10 +159,10 @@ SETTINGS = {
 # fmt: on
 
 
-# What a suite of hidden goals changes, in every preset. The instruction tells nothing here, so that
-# it need not be left out for the demonstration to be read. One map moves all scenes of a task, which
-# makes new goals; a map of each scene's own would hide the goal. What was learned is measured on
-# novel goals, without adapting to them.
+# What a suite of hidden goals changes, in every preset. The instruction tells nothing here, and need
+# not be left out for the demonstration to be read. One map moves all scenes of a task, which makes
+# new goals; a map of each scene's own would hide the goal. What was learned is measured on novel
+# goals, without adapting to them.
 HIDDEN_GOALS = {
     "base_tasks": 160,
     "demonstrations": 3,  # one to read, one for the support windows, one for the query windows
