@@ -159,7 +159,7 @@ SETTINGS = {
 # fmt: on
 
 
-# What a suite of hidden goals changes, in every preset. The instruction tells nothing here, and need
+# What a suite of hidden goals changes, in every preset. The instruction tells nothing, and need
 # not be left out for the demonstration to be read. One map moves all scenes of a task, which makes
 # new goals; a map of each scene's own would hide the goal. What was learned is measured on novel
 # goals, without adapting to them.
