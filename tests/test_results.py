@@ -7,13 +7,17 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from hidden_goals import names_of
 from model import PolicyConfig
 from report import wilson_interval
+from simulator import SIMULATORS
 from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
-from tests.runs import LIMITS, LONGER, TUNING, VARIANTS
+from tests.runs import HIDDEN_METHOD, HIDDEN_REPORTS, LIMITS, LONGER, TUNING, VARIANTS
 from train import SETTINGS, Settings, parse
 
 HELD = json.loads(RESULTS.read_text())
+HIDDEN = {name: run for name, run in HELD.items() if name.startswith("goals-")}
+ML = {name: run for name, run in HELD.items() if name not in HIDDEN}
 
 # RESULTS.json keeps every record as it was written, with the names that were used that day. These
 # have another one today.
@@ -64,7 +68,7 @@ def test_a_comparison_counts_what_is_won_and_lost_on_the_same_goals():
 
 
 def test_runs_are_of_the_variants_that_they_name():
-    for name, run in HELD.items():
+    for name, run in ML.items():
         suite, variant, seed = re.fullmatch(r"(ml\d\d-)?(.*)-seed(\d)", name).groups()
         variant = variant.removesuffix("-eight").removesuffix("-cpu")
         arguments = with_new_names(run["training"]["arguments"])
@@ -94,6 +98,8 @@ def test_runs_are_of_the_variants_that_they_name():
 
 def test_the_settings_of_a_run_are_those_of_today():
     for name, run in HELD.items():
+        if "training" not in run:  # of tests.controls
+            continue
         arguments = with_new_names(run["training"]["arguments"])
         assert set(arguments) <= {field.name for field in fields(Settings)}, name
         assert set(run["training"]["config"]) <= {field.name for field in fields(PolicyConfig)}, (
@@ -102,7 +108,7 @@ def test_the_settings_of_a_run_are_those_of_today():
 
 
 def test_every_result_says_how_it_was_measured():
-    for name, run in HELD.items():
+    for name, run in ML.items():
         suite = TASKS["ml45" if name.startswith("ml45") else "ml10"]
         training = run["training"]
         assert {"command", "hardware", "arguments", "config", "minutes"} <= set(training)
@@ -118,3 +124,26 @@ def test_every_result_says_how_it_was_measured():
                 assert set(tasks) <= {*suite["base"], *suite["novel"]}
                 assert set("".join(tasks.values())) <= {*"01"}
                 assert len({len(episodes) for episodes in tasks.values()}) == 1
+
+
+def test_runs_on_hidden_goals_are_those_of_the_queue_and_say_how_they_were_measured():
+    for name, run in HIDDEN.items():
+        suite, skill, variant = re.fullmatch(r"(goals-(.+?))-([a-z-]+)(?:-seed\d)?", name).groups()
+        assert suite in SIMULATORS
+        reports = {part: run[part] for part in run if part != "training"}
+        if variant == "controls":
+            assert list(reports) == ["novel"]
+        else:
+            arguments, config = run["training"]["arguments"], run["training"]["config"]
+            given = vars(parse(HIDDEN_METHOD[variant].split()))
+            for flag, value in given.items():
+                if value is not None and flag != "resume":
+                    assert {**arguments, **config}[flag] == value, (name, flag)
+            assert arguments["seed"] == int(name[-1]) and arguments["suite"] == suite
+            assert {"command", "hardware", "minutes"} <= set(run["training"])
+            assert all(variant in HIDDEN_REPORTS[report][1] for report in reports)
+        for report in reports.values():
+            assert {"command", "hardware", "date"} <= set(report["provenance"])
+            for tasks in report["successes"].values():
+                assert list(tasks) == names_of(skill, "novel")
+                assert {len(episodes) for episodes in tasks.values()} == {5}
