@@ -628,7 +628,9 @@ class Evaluation:
 
     def roll_out(self, checkpoint: Path, **options: Any) -> Outcomes:
         """Rolls a checkpoint out; `options` are those of `evaluate.evaluate_checkpoint`."""
-        defaults = {
+        arguments = {
+            "checkpoint": checkpoint,
+            "simulator": self.simulator,
             "recordings": self.recordings,
             "text": {task: self.text[task] for task in self.recordings},
             "episodes": self.settings.episodes,
@@ -637,7 +639,7 @@ class Evaluation:
             "device": self.device,
             "n_demonstrations": self.n_demonstrations,
         }
-        return evaluate.evaluate_checkpoint(checkpoint, self.simulator, **{**defaults, **options})
+        return evaluate.evaluate_checkpoint(**{**arguments, **options})
 
     def run(self, step: int, stop: StopRequest) -> Outcomes | None:
         """Rolls out the checkpoint of a step and logs the outcomes, or reads them from the log.
@@ -1208,11 +1210,21 @@ def main(argv: Sequence[str] | None = None) -> None:
             print(f"preset {name} on {where}, {tasks}, in {folder}", flush=True)
             check_folder(folder, args.resume)
             if simulator is not None:
-                for tasks, episodes in (
-                    (list(paths), settings.demonstrations),
-                    (list(novel_paths), simulator.demonstrations),
-                ):
-                    collect(simulator, tasks, data, episodes=episodes, workers=args.workers)
+                collect(
+                    simulator,
+                    list(paths),
+                    data,
+                    episodes=settings.demonstrations,
+                    workers=args.workers,
+                )
+                if novel_paths:
+                    collect(
+                        simulator,
+                        list(novel_paths),
+                        data,
+                        episodes=simulator.demonstrations,
+                        workers=args.workers,
+                    )
         if world > 1:
             dist.barrier()
         run(
