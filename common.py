@@ -124,7 +124,8 @@ def choose(name: str, names: Iterable[str], kind: str) -> str:
     if name in names:
         return name
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.4)
-    advice = f"did you mean {near[0]!r}?" if near else f"choose one of: {', '.join(names)}"
+    listed = ", ".join(names[:60]) + (" ..." if len(names) > 60 else "")
+    advice = f"did you mean {near[0]!r}?" if near else f"choose one of: {listed}"
     raise UserError(f"unknown {kind} {name!r}: {advice}")
 
 

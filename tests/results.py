@@ -372,7 +372,7 @@ def length_table(results: Results) -> str:
     """A row a checkpoint of the run whose checkpoints were all measured."""
     rows = [["outer steps", "minutes", "base tasks"]]
     for run in results.values():
-        training = run["training"]
+        training = run.get("training", {})
         for label, tasks in run.get("top", {}).get("checkpoints", {}).items():
             step = int(label[-5:])
             minutes = training["minutes"] * step / training["arguments"]["steps"]
