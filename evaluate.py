@@ -95,6 +95,11 @@ DEMONSTRATION_CONTROLS = {
 # ---- The inner step, as adaptation ---------------------------------------------------------------
 
 
+def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
+    """The loss () of a policy with these parameters in place of its own, as maml.py takes it."""
+    return functional_call(policy, params, (), batch)
+
+
 def inner_rate(info: dict[str, Any], device: str | torch.device) -> maml.InnerRate:
     """The learning rate of a checkpoint's inner step: one number, or those that it learned."""
     learned = info.get("inner_rates")
@@ -140,9 +145,7 @@ def take_inner_steps(
     }
     support = {name: x.to(text.device) for name, x in support.items()}
 
-    def loss_fn(params: maml.Params, inputs: dict[str, Tensor]) -> Tensor:
-        return functional_call(policy, params, (), inputs)
-
+    loss_fn = partial(loss_of, policy)
     params = {name: p.detach() for name, p in policy.named_parameters()}
     for step in range(1, steps + 1):
         params = maml.adapt(loss_fn, params, support, lr)
@@ -380,7 +383,7 @@ def instruction_features(
 # ---- Evaluation in worker processes --------------------------------------------------------------
 
 # What a worker process keeps between its jobs: policy and simulator; of the task that it worked on
-# last the sampler and the environments.
+# last the policy, adapted to it where there are inner steps, the sampler and the environments.
 worker_state: dict[str, Any] = {}
 
 
@@ -488,33 +491,34 @@ def rollout_job(
     stop_at_success: bool,
 ) -> list[list[bool]]:
     """`rollout` of the episodes of these seeds, of one task, in a worker process."""
-    policy = worker_state["policy"]
-    device = policy.normalizer.action_scale.device
+    device = worker_state["policy"].normalizer.action_scale.device
+    feature = torch.from_numpy(text).to(device)  # (text_dim,)
     if worker_state["task"] != task:
+        policy, info = worker_state["policy"], worker_state["info"]
         demonstrations = load_demonstrations(recording).take(n_demonstrations)
         sampler = WindowSampler(demonstrations, policy.config, device=device)
-        worker_state.update(task=task, sampler=sampler, environments=[])
+        if inner_steps > 0:
+            *_, (_, _, policy) = take_inner_steps(
+                policy,
+                sampler,
+                feature,
+                steps=inner_steps,
+                batch=support or info["arguments"]["support"],
+                lr=inner_rate(info, device),
+            )
+        worker_state.update(task=task, task_policy=policy, sampler=sampler, environments=[])
+    policy = worker_state["task_policy"]
     while len(worker_state["environments"]) < len(seeds):
         worker_state["environments"].append(
             worker_state["simulator"].make(task, policy.config.num_points)
         )
 
-    if inner_steps > 0:
-        info = worker_state["info"]
-        *_, (_, _, policy) = take_inner_steps(
-            policy,
-            worker_state["sampler"],
-            torch.from_numpy(text).to(device),
-            steps=inner_steps,
-            batch=support or info["arguments"]["support"],
-            lr=inner_rate(info, device),
-        )
     successes = rollout(
         policy,
         environments=worker_state["environments"][: len(seeds)],
         seeds=seeds,
         sampler=worker_state["sampler"],
-        text=torch.from_numpy(text).to(device),
+        text=feature,
         generator=torch.Generator().manual_seed(seeds[0]),
         demonstration_control=demonstration_control,
         stop_at_success=stop_at_success,

@@ -43,11 +43,11 @@ GOAL_LOW, GOAL_HIGH = (-0.30, 0.50, 0.05), (0.30, 0.90, 0.30)
 GOAL_DISTANCE = (0.21, 0.32)
 ON_TABLE = 0.02  # the height of the goals of push
 
-# Where the object and the hand begin, at most so far from a middle.
+# Where the object begins, at most so far from a middle, and the box in which the hand begins.
 OBJECT_MIDDLE, OBJECT_SPREAD = (0.0, 0.65), (0.05, 0.03)
 HAND_LOW, HAND_HIGH = (-0.15, 0.48, 0.12), (0.15, 0.72, 0.32)
 
-# Of the gripper and the puck, which are all that is seen, fewer rays show enough.
+# Only gripper and puck are seen, and fewer rays than in Meta-World's other suites show enough.
 CAMERA_PIXELS = 64
 NUM_POINTS = 64
 

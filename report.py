@@ -115,15 +115,15 @@ def success_table(
     columns: dict[str, Successes],
     parts: Parts | None = None,
     paper: PaperColumns | None = None,
-    of: str = "task",
+    first_title: str = "task",
 ) -> str:
     """A Markdown table: a row for each task, and one for the mean of each part.
 
     Args:
         columns: title -> results; all of them of the same tasks.
         parts: see `Parts`; by default there is one mean, that of all tasks. A single task has none.
-        of: what the rows are of.
         paper: more columns, see `paper_columns`; those that have none of the tasks are left out.
+        first_title: that of the column that names the rows.
     """
     tasks = list(next(iter(columns.values())))
     if parts is None:
@@ -139,7 +139,7 @@ def success_table(
             cells.append(f"{np.mean(known):.1f}" if len(known) == len(row_tasks) else "")
         return cells
 
-    rows = [[of, *columns, *paper]]
+    rows = [[first_title, *columns, *paper]]
     rows += [row(task, [task]) for task in tasks]
     if len(tasks) > 1:
         rows += [row(f"**{name}**", part_tasks) for name, part_tasks in parts.items()]
@@ -211,7 +211,7 @@ def write_report(
         columns = {"any step": pool_tasks(any_step)}
         if at_end:
             columns["at the end"] = pool_tasks(at_end)
-        table = success_table(columns, parts={}, of="success, percent")
+        table = success_table(columns, parts={}, first_title="success, percent")
     else:
         columns = dict(any_step)
         for label, successes in at_end.items():

@@ -34,7 +34,6 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor
-from torch.func import functional_call
 from torch.optim.swa_utils import AveragedModel
 
 import baselines
@@ -265,11 +264,6 @@ def task_batch(
     return {name: x.to(text.device) for name, x in batch.items()}
 
 
-def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
-    """The loss () of a policy with these parameters in place of its own, as maml.py takes it."""
-    return functional_call(policy, params, (), batch)
-
-
 def multi_task_loss(policy: DAMIPolicy, batches: list[dict[str, Tensor]]) -> Tensor:
     """The mean loss () of all windows of all tasks, whose batches are as long as each other."""
     if len({batch["demo_points"].shape for batch in batches}) == 1:  # demonstrations can be stacked
@@ -315,7 +309,7 @@ def maml_gradient(
     """
     inner_lr = inner_rate(log_rates, settings)
     gradients, rate_gradients, losses = meta_gradient(
-        partial(loss_of, policy),
+        partial(evaluate.loss_of, policy),
         dict(policy.named_parameters()),
         [split(batch, settings.support) for batch in batches],
         lr=inner_lr,
@@ -798,7 +792,8 @@ def heldout_controls(
             )
             adapted = copy.deepcopy(policy)
             adapted.load_state_dict(
-                adapt(partial(loss_of, policy), params, support, inner_lr, steps), strict=False
+                adapt(partial(evaluate.loss_of, policy), params, support, inner_lr, steps),
+                strict=False,
             )
             measured[task] = evaluate.action_error(
                 adapted, train_samplers[task], heldout_sampler, text[task]

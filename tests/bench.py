@@ -45,6 +45,7 @@ from evaluate import (
     checkpoints_of,
     instruction_features,
     load_trained,
+    loss_of,
     rollout,
 )
 from finetune import BATCH, LEARNING_RATES, adapt_policy
@@ -53,7 +54,7 @@ from metaworld_env import MetaWorld
 from model import PRESETS, CheckpointError, DAMIPolicy, PolicyConfig, split
 from simulator import collect, demonstration_seed, evaluation_seed, record_episode
 from tests.textbook import TextbookDP3, training_step
-from train import SETTINGS, Settings, loss_of, multi_task_gradient, task_batch
+from train import SETTINGS, Settings, multi_task_gradient, task_batch
 
 SIMULATOR = MetaWorld()
 SUITE = "ml10"

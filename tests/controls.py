@@ -18,9 +18,10 @@ import numpy as np
 
 from common import command_line, locked, provenance, report_progress, run_jobs
 from data import load_demonstrations
-from evaluate import EVALUATION_SEED, claim_results
+from evaluate import claim_results
 from report import Outcomes, write_report
 from simulator import Simulator, collect, evaluation_seed, simulator_of
+from tests.runs import SEED
 
 CONTROLS = ("replay", "servo", "expert")
 STIFFNESS = 5.0  # of the servo: an action of 1 for 20 centimetres, as Meta-World's script for reach
@@ -61,6 +62,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--suite", default="goals-reach", help="of hidden goals (goals-reach)")
     parser.add_argument("--data", default="data", help="folder of the demonstrations (data)")
     parser.add_argument("--episodes", type=int, default=5, help="episodes a task (5)")
+    parser.add_argument("--seed", type=int, default=SEED, help=f"of the starts ({SEED})")
     parser.add_argument("--workers", type=int, help="processes (one a core)")
     parser.add_argument("--out", default="runs/controls", help="folder of the report")
     args = parser.parse_args(argv)
@@ -73,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         recordings = collect(
             simulator, tasks, args.data, episodes=simulator.demonstrations, workers=args.workers
         )
-        seeds = [evaluation_seed(EVALUATION_SEED, i) for i in range(args.episodes)]
+        seeds = [evaluation_seed(args.seed, i) for i in range(args.episodes)]
         jobs: list[dict[str, Any]] = [
             {"simulator": simulator, "task": task, "recording": recording, "seeds": seeds}
             for task, recording in recordings.items()
@@ -87,15 +89,25 @@ def main(argv: Sequence[str] | None = None) -> None:
         )
         outcomes = {
             control: Outcomes(
-                {task: [any(s) for s in of[control]] for task, of in zip(tasks, results)},
-                {task: [s[-1] for s in of[control]] for task, of in zip(tasks, results)},
+                any_step={
+                    task: [any(steps) for steps in successes[control]]
+                    for task, successes in zip(tasks, results)
+                },
+                at_end={
+                    task: [steps[-1] for steps in successes[control]]
+                    for task, successes in zip(tasks, results)
+                },
             )
             for control in CONTROLS
         }
-        facts = provenance(
-            "-m", ["tests.controls", *(sys.argv[1:] if argv is None else argv)], "cpu"
-        )
-        print(write_report(out, outcomes, {"title": "no network", **facts}, pooled=True))
+        arguments = sys.argv[1:] if argv is None else argv
+        report = {
+            "title": "no network",
+            "episodes a task": args.episodes,
+            "seed": args.seed,
+            **provenance("-m", ["tests.controls", *arguments], "cpu"),
+        }
+        print(write_report(out, outcomes, report, pooled=True))
 
 
 if __name__ == "__main__":

@@ -709,6 +709,30 @@ def test_old_results_stay_where_the_new_ones_are_refused(run, recordings, monkey
     assert Path("report/success.json").exists()
 
 
+def test_a_control_keeps_of_a_demonstration_what_its_name_says():
+    generator = torch.Generator().manual_seed(0)
+    whole = {
+        "demo_points": torch.rand(1, 6, 4, 3, generator=generator),
+        "demo_state": torch.rand(1, 6, 5, generator=generator),
+        "demo_action": torch.rand(1, 6, 2, generator=generator),
+    }
+    changed = {name: make(whole) for name, make in evaluate.DEMONSTRATION_CONTROLS.items()}
+    for demonstration in changed.values():
+        assert {n: x.shape for n, x in demonstration.items()} == {
+            n: x.shape for n, x in whole.items()
+        }
+    assert not any(x.any() for x in changed["zeros"].values())
+    for name, x in changed["last-frame"].items():
+        assert all(torch.equal(x[:, t], whole[name][:, -1]) for t in range(6))
+    for name, x in changed["no-actions"].items():
+        assert not x.any() if name == "demo_action" else torch.equal(x, whole[name])
+    order = [  # one for all three
+        [int((whole[name][0] == frame).flatten(1).all(1).nonzero()) for frame in x[0]]
+        for name, x in changed["shuffled"].items()
+    ]
+    assert order[0] == order[1] == order[2] != list(range(6)) and sorted(order[0]) == [*range(6)]
+
+
 # ---- Animations ----------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ from model import PolicyConfig
 from report import wilson_interval
 from simulator import SIMULATORS
 from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
-from tests.runs import HIDDEN_METHOD, HIDDEN_REPORTS, LIMITS, LONGER, TUNING, VARIANTS
+from tests.runs import HIDDEN_METHOD, HIDDEN_REPORTS, LIMITS, LONGER, SEED, TUNING, VARIANTS
 from train import SETTINGS, Settings, parse
 
 HELD = json.loads(RESULTS.read_text())
@@ -144,6 +144,7 @@ def test_runs_on_hidden_goals_are_those_of_the_queue_and_say_how_they_were_measu
             assert all(variant in HIDDEN_REPORTS[report][1] for report in reports)
         for report in reports.values():
             assert {"command", "hardware", "date"} <= set(report["provenance"])
+            assert report["provenance"]["seed"] == SEED  # of the starts: rows are compared
             for tasks in report["successes"].values():
                 assert list(tasks) == names_of(skill, "novel")
                 assert {len(episodes) for episodes in tasks.values()} == {5}

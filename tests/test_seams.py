@@ -200,14 +200,19 @@ def test_training_where_no_observation_tells_the_task_ends_with_what_tells_it(
     """Own, another's and no demonstration, each also after an inner step; and an animation."""
     films = []
     monkeypatch.setattr(evaluate, "animate", lambda of_tasks, *_: films.append(list(of_tasks)))
-    measured = []
-    original = evaluate.rollout_job
+    measured, biases = [], []  # of each job; and a parameter of the policy that is rolled out
+    rollout_job, rollout = evaluate.rollout_job, evaluate.rollout
 
-    def watched(**arguments):
+    def watched_job(**arguments):
         measured.append((arguments["demonstration_control"], arguments["inner_steps"]))
-        return original(**arguments)
+        return rollout_job(**arguments)
 
-    monkeypatch.setattr(evaluate, "rollout_job", watched)
+    def watched_rollout(policy, *arguments, **options):
+        biases.append(policy.denoiser.head[1].bias.detach().clone())
+        return rollout(policy, *arguments, **options)
+
+    monkeypatch.setattr(evaluate, "rollout_job", watched_job)
+    monkeypatch.setattr(evaluate, "rollout", watched_rollout)
     training = "--suite toy --preset tiny --steps 2 --demonstrations 3 --base-tasks 1"
     call(train, f"{training} --evaluate-on novel --episodes 1 --out run {CPU}")
     titles = ["own demonstration", "another task's", "none"]
@@ -215,6 +220,9 @@ def test_training_where_no_observation_tells_the_task_ends_with_what_tells_it(
     assert lengths("run") == {title: {"touch-blue": 1} for title in expected}
     assert measured == [(control, steps) for steps in (0, 1) for control in (None, None, "zeros")]
     assert films == [["touch-blue"]]
+    trained = model.load("run/ema-00002.pt")[0].denoiser.head[1].bias
+    adapted = [not torch.equal(bias, trained) for bias in biases]
+    assert adapted == [False] * 3 + [True] * 3 + [False]  # the last one is the animation's
     printed = capsys.readouterr().out
     assert all(f"| {title} " in printed for title in expected)
     assert len(load_demonstrations("data/touch-blue.npz")) == ToySimulator.demonstrations

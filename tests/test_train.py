@@ -183,6 +183,26 @@ def test_both_shares_are_drawn_apart():
     assert kinds.count((True, True)) == pytest.approx(50, abs=20)
 
 
+def test_the_tasks_of_a_step_and_of_a_training_follow_from_the_seed():
+    settings = train.Settings(seed=3, tasks_per_step=4)
+    steps = [train.tasks_of_step(step, 10, settings) for step in range(200)]
+    assert all(len(set(places)) == 4 and places == sorted(places) for places in steps)
+    assert steps == [train.tasks_of_step(step, 10, settings) for step in range(200)]
+    counts = np.bincount(np.concatenate(steps), minlength=10)
+    assert counts.min() > 50 and steps[0] != steps[1]  # each is drawn, about 80 times
+    assert train.tasks_of_step(0, 10, replace(settings, seed=4)) != steps[0]
+    for every in (None, 10, 11):
+        assert train.tasks_of_step(7, 10, replace(settings, tasks_per_step=every)) == [*range(10)]
+
+    names = [f"task-{i}" for i in range(10)]
+    drawn = [train.draw_base_tasks(names, train.Settings(seed=s, base_tasks=4)) for s in range(5)]
+    assert all(len(set(of)) == 4 and of == sorted(of) for of in drawn)
+    assert len({tuple(of) for of in drawn}) == 5
+    assert train.draw_base_tasks(names, train.Settings()) == names
+    with pytest.raises(common.UserError, match="--base-tasks is 11: ml10 has 10"):
+        train.draw_base_tasks(names, train.Settings(base_tasks=11))
+
+
 def test_products_in_bfloat16_leave_nearly_the_same_gradient():
     torch.manual_seed(0)
     policy, sampler = one_task()
