@@ -43,16 +43,22 @@ TYPES = {
     "payload": "DOUBLE",
     **{f"output_int_register_{i}": "INT32" for i in range(48)},
 }
-INPUT_TYPES = {f"input_double_register_{i}": "DOUBLE" for i in range(48)}
-INPUT_TYPES |= {f"input_int_register_{i}": "INT32" for i in range(48)}
-INPUT_TYPES |= {"speed_slider_mask": "UINT32", "speed_slider_fraction": "DOUBLE"}
-INPUT_TYPES |= {
-    f"{kind}_digital_output{part}": "UINT8"
-    for kind in ("standard", "configurable", "tool")
-    for part in ("_mask", "")
+INPUT_TYPES = {
+    **{f"input_double_register_{i}": "DOUBLE" for i in range(48)},
+    **{f"input_int_register_{i}": "INT32" for i in range(48)},
+    "speed_slider_mask": "UINT32",
+    "speed_slider_fraction": "DOUBLE",
+    "standard_digital_output_mask": "UINT8",
+    "standard_digital_output": "UINT8",
+    "configurable_digital_output_mask": "UINT8",
+    "configurable_digital_output": "UINT8",
+    "tool_digital_output_mask": "UINT8",
+    "tool_digital_output": "UINT8",
+    "standard_analog_output_mask": "UINT8",
+    "standard_analog_output_type": "UINT8",
+    "standard_analog_output_0": "DOUBLE",
+    "standard_analog_output_1": "DOUBLE",
 }
-INPUT_TYPES |= {f"standard_analog_output_{part}": "UINT8" for part in ("mask", "type")}
-INPUT_TYPES |= {f"standard_analog_output_{part}": "DOUBLE" for part in (0, 1)}
 CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT8": "B", "VECTOR6D": "6d"}
 START_POSE = (-0.20, -0.55, 0.30, 0.0, 3.0, 0.0)  # metres and axis-angle radians, base frame
 CAMERA = (-0.20, -0.55, 0.90)  # of the scene, metres, base frame
@@ -140,8 +146,12 @@ class Emulator:
         self.ports = {name: server.getsockname()[1] for name, server in self.servers.items()}
 
     def __enter__(self) -> "Emulator":
-        handlers = {"rtde": self.serve_rtde, "script": self.serve_script}
-        handlers |= {"dashboard": self.serve_dashboard, "gripper": self.serve_gripper}
+        handlers = {
+            "rtde": self.serve_rtde,
+            "script": self.serve_script,
+            "dashboard": self.serve_dashboard,
+            "gripper": self.serve_gripper,
+        }
         for name, server in self.servers.items():
             threading.Thread(target=self.accept, args=(server, handlers[name]), daemon=True).start()
         threading.Thread(target=self.move, daemon=True).start()
@@ -381,7 +391,7 @@ class Emulator:
         me, names, frequency, sending, buffer, due = id(connection), [], 125.0, False, b"", 0.0
         recipes: dict[int, list[str]] = {}
         batch: list[bytes] = []
-        said = len(self.messages)
+        messages_sent = len(self.messages)
 
         def send(kind: str, payload: bytes) -> None:
             package = struct.pack(">HB", 3 + len(payload), ord(kind)) + payload
@@ -423,7 +433,8 @@ class Emulator:
                     number = len(recipes) + 1 if all(kind in CODES for kind in kinds) else 0
                     if number:
                         recipes[number] = fields
-                        self.owners |= dict.fromkeys(fields, me)
+                        for name in fields:
+                            self.owners[name] = me
                 send("I", bytes([number]) + ",".join(kinds).encode())
             elif kind == "S":
                 sending, due = bool(names), time.monotonic()
@@ -463,10 +474,10 @@ class Emulator:
                     kind, payload, buffer = chr(buffer[2]), buffer[3:size], buffer[size:]
                     if not handle(kind, payload):
                         return
-                while said < len(self.messages):
-                    said += 1
+                while messages_sent < len(self.messages):
+                    messages_sent += 1
                     if sending:
-                        say(self.messages[said - 1], 1)
+                        say(self.messages[messages_sent - 1], 1)
                 if sending and not self.faults.silent and time.monotonic() >= due:
                     due = max(due + 1 / frequency, time.monotonic() - 1 / frequency)
                     payload = b"\x01"
