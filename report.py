@@ -324,7 +324,7 @@ def plot_curves(folder: Path) -> None:
         right.spines["top"].set_visible(False)
         if successes:
             handles += right.plot(*zip(*successes), "o-", color="C1", label="success (right)")
-            right.set(ylabel="mean success on base tasks, %", ylim=(0, 100))
+            right.set(ylabel="mean success, %", ylim=(0, 100))
         else:
             handles += right.plot(*zip(*errors), "o-", color="C1", label="action error (right)")
             right.set_ylabel("held-out action error")
