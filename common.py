@@ -380,6 +380,94 @@ class StopRequest:
 worker: dict[str, Any] = {"progress": None, "setup": None}
 
 
+class WorkerPool:
+    """Processes that call jobs, kept from one call of `run` to the next.
+
+        with WorkerPool(workers) as pool:
+            for ...:
+                results = pool.run(job, jobs, bar)
+
+    Args:
+        workers: processes; None: one a core.
+        setup: called once in each process before its first job; a function of a module, or a
+            `functools.partial` of one.
+
+    Raises UserError if `workers` is below 1.
+    """
+
+    def __init__(self, workers: int | None, setup: Callable[[], None] | None = None):
+        if workers is not None and workers < 1:
+            raise UserError(f"--workers is {workers}: use at least 1")
+        context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
+        self.existing_children = set(multiprocessing.active_children())
+        self.started = False  # whether a process ever was
+        with ignored_signals():
+            self.progress = context.SimpleQueue()
+            self.executor = ProcessPoolExecutor(
+                workers or os.cpu_count() or 1, context, start_worker, (self.progress, setup)
+            )
+
+    def run(
+        self, job: Callable[..., Any], jobs: Sequence[dict[str, Any]], bar: tqdm | None = None
+    ) -> list:
+        """Calls `job(**arguments)` for each dictionary of arguments.
+
+        Args:
+            job: a function of a module; it may call `report_progress`, which moves `bar`.
+            jobs: the keyword arguments of each call.
+
+        Returns:
+            What the calls returned, in the order of `jobs`.
+
+        Raises:
+            UserError: a worker process was killed or could not start.
+            Exception: what a job raised. The other jobs are ended by then, and no process is left.
+        """
+        with ignored_signals():  # workers inherit that: a terminal sends Ctrl-C to them, too
+            futures = [self.executor.submit(run_job, job, arguments) for arguments in jobs]
+        finished = False
+        try:
+            pending = set(futures)
+            while pending:
+                done, pending = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
+                while not self.progress.empty():
+                    text, amount = self.progress.get()
+                    self.started = True
+                    if bar is not None:
+                        bar.set_postfix_str(text)
+                        bar.update(amount)
+                for future in done:
+                    future.result()  # raises what the job raised
+            finished = True
+            return [future.result() for future in futures]
+        except BrokenProcessPool:
+            if self.started:
+                problem = "a worker process was killed, perhaps for memory: try fewer --workers"
+            else:
+                problem = (
+                    "worker processes could not start: a script that collects or evaluates must do "
+                    'so under `if __name__ == "__main__":`, since each process imports it once more'
+                )
+            raise UserError(problem) from None
+        finally:
+            if not finished:
+                self.end(at_once=True)
+
+    def end(self, at_once: bool = False) -> None:
+        """Ends the processes, after the jobs at hand or `at_once`, and waits for them."""
+        with ignored_signals():
+            if at_once:
+                for process in set(multiprocessing.active_children()) - self.existing_children:
+                    process.kill()
+            self.executor.shutdown(cancel_futures=True)
+
+    def __enter__(self) -> "WorkerPool":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.end()
+
+
 def run_jobs(
     job: Callable[..., Any],
     jobs: Sequence[dict[str, Any]],
@@ -390,63 +478,19 @@ def run_jobs(
     unit: str = "episode",
     setup: Callable[[], None] | None = None,
 ) -> list:
-    """Calls `job(**arguments)` for each dictionary of arguments, in several processes.
+    """Calls jobs in a `WorkerPool` that lives as long as they do, with a progress bar.
 
     Args:
-        job: a function of a module; it may call `report_progress`.
-        jobs: the keyword arguments of each call.
-        workers: processes; None: one a core.
+        job, jobs, workers, setup: see `WorkerPool`.
         total, description, unit: what the progress bar counts to, its name, what it counts.
-        setup: called once in each process before its first job; a function of a module, or a
-            `functools.partial` of one.
 
-    Returns:
-        What the calls returned, in the order of `jobs`.
-
-    Raises:
-        UserError: `workers` is below 1, or a worker process was killed or could not start.
-        Exception: what a job raised. The other jobs are ended by then, and no process is left.
+    Returns and raises what `WorkerPool.run` does.
     """
-    if workers is not None and workers < 1:
-        raise UserError(f"--workers is {workers}: use at least 1")
-    if not jobs:
-        return []
-    context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
-    existing_children = set(multiprocessing.active_children())
-    with ignored_signals():  # workers inherit that: a terminal sends Ctrl-C to them, too
-        progress = context.SimpleQueue()
-        count = min(workers or os.cpu_count() or 1, len(jobs))
-        pool = ProcessPoolExecutor(count, context, start_worker, (progress, setup))
-        futures = [pool.submit(run_job, job, arguments) for arguments in jobs]
-    started = False
-    try:
+    if workers is None:
+        workers = os.cpu_count() or 1
+    with WorkerPool(min(workers, max(1, len(jobs))), setup) as pool:
         with progress_bar(total=total, desc=description, unit=unit) as bar:
-            pending = set(futures)
-            while pending:
-                done, pending = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
-                while not progress.empty():
-                    text, amount = progress.get()
-                    started = True
-                    bar.set_postfix_str(text)
-                    bar.update(amount)
-                for future in done:
-                    future.result()  # raises what the job raised
-        return [future.result() for future in futures]
-    except BrokenProcessPool:
-        if started:
-            problem = "a worker process was killed, perhaps for memory: try fewer --workers"
-        else:
-            problem = (
-                "worker processes could not start: a script that collects or evaluates must do so "
-                'under `if __name__ == "__main__":`, since each process imports it once more'
-            )
-        raise UserError(problem) from None
-    finally:
-        with ignored_signals():
-            if not all(future.done() and not future.exception() for future in futures):
-                for process in set(multiprocessing.active_children()) - existing_children:
-                    process.kill()
-            pool.shutdown(cancel_futures=True)  # waits for the processes
+            return pool.run(job, jobs, bar)
 
 
 @contextmanager

@@ -241,6 +241,14 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         positions = np.concatenate([hand, right_finger, left_finger])  # (9,)
         return {"point_cloud": self.cloud(), "agent_pos": positions.astype(np.float32)}
 
+    def hidden_goal_state(self) -> np.ndarray:
+        """Returns Meta-World's own observation (39,) float32, in which zeros stand for the goal.
+
+        It is what Meta-World's benchmarks show to a learner: positions, of this moment and of the
+        one before. rl.py reads it.
+        """
+        return np.append(self.expert_observation[:-3], np.zeros(3)).astype(np.float32)
+
     def cloud(self) -> np.ndarray:
         """Returns farthest points of what the camera sees of all but the arm, (N, 3) float32.
 

@@ -1,0 +1,259 @@
+"""Tests of rl.py: its gradients against finite differences, and that it learns."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+
+import rl
+from common import UserError, command_line
+from rl import AdaptedPolicies, GaussianPolicy, Rollouts, Settings
+from simulator import SIMULATORS
+
+
+class PointEnvironment:
+    """A point in the plane that moves to a goal which its state does not show."""
+
+    def begin(self, seed):
+        self.steps, self.position = 0, np.zeros(2)
+        angle = np.random.default_rng(seed).uniform(0, 2 * np.pi)
+        self.goal = np.array([np.cos(angle), np.sin(angle)])
+
+    def hidden_goal_state(self):
+        return self.position.astype(np.float32)
+
+    def expert_action(self):
+        return np.float32(self.goal - self.position)
+
+    def advance(self, action):
+        self.position = self.position + 0.2 * np.clip(action, -1, 1)
+        self.steps += 1
+        away = np.linalg.norm(self.goal - self.position)
+        return float(-away), self.steps >= 10, {"success": bool(away < 0.3)}
+
+
+@dataclass(frozen=True)
+class PointSimulator:
+    """A `simulator.Simulator` as far as rl.py needs one."""
+
+    episode_steps: int = 10
+    name: ClassVar[str] = "point"
+    recipe: ClassVar[dict] = {"num_points": 1}
+
+    def tasks(self, suite):
+        return ["move"], ["move-again"]
+
+    def make(self, task, num_points):
+        return PointEnvironment()
+
+
+class Here:
+    """In place of `common.WorkerPool`: in this process."""
+
+    def run(self, job, jobs, bar=None):
+        return [job(**arguments) for arguments in jobs]
+
+
+POINT = Settings(tasks=6, rollouts=6, hidden=32)
+
+
+def random_batches(n, policy, seed=0):
+    """(support, query) of n tasks, in float64."""
+    generator = torch.Generator().manual_seed(seed)
+    state_dim, action_dim, _ = rl.policy_shape(policy)
+
+    def batch():
+        def draw(*shape):
+            return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+        return {
+            "states": draw(30, state_dim),
+            "actions": draw(30, action_dim),
+            "advantages": draw(30),
+        }
+
+    return [batch() for _ in range(n)], [batch() for _ in range(n)]
+
+
+@pytest.fixture
+def adapted():
+    """Three adapted policies, their parameters and batches, all of float64."""
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, hidden=5).double()
+    support, query = random_batches(3, policy)
+    stacked = [
+        {name: torch.stack([b[name] for b in batches]) for name in batches[0]}
+        for batches in (support, query)
+    ]
+    params = {name: p.detach() for name, p in policy.named_parameters()}
+    return AdaptedPolicies(policy, *stacked, inner_lr=0.3), params, support, query
+
+
+# ---- Gradients -----------------------------------------------------------------------------------
+
+
+def test_the_outer_gradient_is_that_of_trpos_loss_through_the_inner_step(adapted):
+    policies, params, support, query = adapted
+    old = policies.gaussians(params)
+    gradient, _, _ = rl.meta_gradient(
+        policies.policy.loss, params, list(zip(support, query)), lr=policies.inner_lr
+    )
+    theta, step = rl.flatten(params), 1e-5
+    for i in range(0, len(theta), 7):
+        sides = []
+        for sign in (1, -1):
+            moved = theta.clone()
+            moved[i] += sign * step
+            loss, _ = policies.loss_and_divergence(rl.unflatten(moved, params), old)
+            sides.append(loss)
+        difference = (sides[0] - sides[1]) / (2 * step)
+        assert rl.flatten(gradient)[i].item() == pytest.approx(difference, rel=1e-5, abs=1e-8)
+
+
+def test_the_fisher_product_is_the_second_derivative_of_the_divergence(adapted):
+    policies, params, _, _ = adapted
+    old = [x.detach() for x in policies.gaussians(params)]
+    theta = rl.flatten(params)
+
+    def divergence(vector):
+        mean, log_std = policies.gaussians(rl.unflatten(vector, params))
+        old_mean, old_log_std = old
+        var, old_var = torch.exp(2 * log_std), torch.exp(2 * old_log_std)
+        kl = log_std - old_log_std + (old_var + (mean - old_mean) ** 2) / (2 * var) - 0.5
+        return kl.sum(-1).mean()
+
+    hessian = torch.autograd.functional.hessian(divergence, theta)
+    product = policies.fisher_product(params, damping=0.01)
+    v = torch.randn(len(theta), generator=torch.Generator().manual_seed(1), dtype=theta.dtype)
+    torch.testing.assert_close(product(v), hessian @ v + 0.01 * v)
+
+
+def test_a_step_improves_the_loss_and_keeps_to_the_divergence(adapted):
+    policies, params, support, query = adapted
+    settings = replace(POINT, inner_lr=policies.inner_lr, max_kl=0.02)
+    old = policies.gaussians(params)
+    old_loss, _ = policies.loss_and_divergence(params, old)
+    figures = rl.trpo_step(policies.policy, support, query, settings)
+    new = {name: p.detach() for name, p in policies.policy.named_parameters()}
+    loss, kl = policies.loss_and_divergence(new, old)
+    assert loss < old_loss - 0.01 and 0.005 < kl <= 0.02
+    assert figures["kl"] == pytest.approx(kl)
+
+
+# ---- Advantages ----------------------------------------------------------------------------------
+
+
+def test_discounted_sums():
+    sums = rl.discounted_sums(np.array([[1.0, 2.0, 4.0]]), 0.5)
+    np.testing.assert_allclose(sums, [[1 + 0.5 * 2 + 0.25 * 4, 2 + 0.5 * 4, 4]])
+
+
+def test_what_the_state_and_the_time_foretell_is_no_advantage():
+    rng = np.random.default_rng(0)
+    states, actions = rng.normal(size=(10, 20, 3)), rng.normal(size=(10, 20, 2))
+    surprise = rng.normal(size=(10, 20))
+    # The return of a step is its reward, as nothing later counts.
+    rewards = 5 + 2 * states[..., 0] - np.arange(20) / 10 + 0.1 * surprise
+    rollouts = Rollouts(states, actions, rewards, successes=np.zeros((10, 20), bool))
+    batch = rl.to_batch(rollouts, replace(POINT, discount=0.0))
+    assert np.corrcoef(batch["advantages"], surprise.reshape(-1))[0, 1] > 0.95
+    assert batch["advantages"].mean().abs() < 1e-5
+    assert batch["advantages"].std() == pytest.approx(1, abs=0.01)
+
+
+# ---- It learns -----------------------------------------------------------------------------------
+
+
+def returns(policy, goals=20, seed=1):
+    """The mean returns to new goals before and after an inner step."""
+    results = [
+        rl.task_job(PointSimulator(), "move", rl.evaluation_seed(seed, i), (seed, i), policy, POINT)
+        for i in range(goals)
+    ]
+    return [np.mean([r.rewards.sum(1).mean() for r in rollouts]) for rollouts in zip(*results)]
+
+
+def test_it_learns_to_find_a_goal_that_only_rewards_tell():
+    torch.manual_seed(0)
+    policy = GaussianPolicy(2, 2, POINT.hidden)
+    untrained_before, untrained_after = returns(policy)
+    for iteration in range(30):
+        rl.iterate(Here(), PointSimulator(), ["move"], policy, iteration, POINT, bar=None)
+    before, after = returns(policy)
+    assert after > before + 3  # of 20 steps, each as far from the goal as its reward says
+    assert after > untrained_after + 3
+    assert untrained_after < untrained_before + 2
+
+
+# ---- Command line --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def point_suite(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(SIMULATORS, "point", PointSimulator)
+    monkeypatch.setattr(rl, "run_jobs", lambda job, jobs, **_: Here().run(job, jobs))
+    monkeypatch.setattr(rl, "WorkerPool", lambda workers: Pool())
+
+    class Pool(Here):
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+    return "--suite point --tasks 2 --rollouts 2 --hidden 8 --episodes 2 --steps".split()
+
+
+def test_a_run_that_was_resumed_ends_with_the_same_weights(point_suite):
+    rl.main([*point_suite, "240", "--out", "whole"])  # three iterations of 80 steps
+    rl.main([*point_suite, "160", "--out", "parts"])
+    rl.main([*point_suite, "240", "--out", "parts", "--resume"])
+    whole, parts = (torch.load(f"{name}/last.pt", weights_only=True) for name in ("whole", "parts"))
+    assert whole["iteration"] == parts["iteration"] == 3
+    for name, weight in whole["weights"].items():
+        assert torch.equal(weight, parts["weights"][name])
+    assert rl.read_json_lines(rl.Path("parts/metrics.jsonl"))[-1]["steps"] == 240
+    assert rl.Path("parts/success.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--resume", "--out", "nothing"], "there is no run to resume"),
+        (["--out", "run"], "add --resume, or another --out"),
+        (["--resume", "--out", "run", "--hidden", "9"], "trained with other settings"),
+        (["--resume", "--out", "damaged"], "is damaged"),
+        (["--suite", "poin"], "did you mean 'point'"),
+        (["--max-kl", "-1"], "--max-kl is -1.0: use at least 0"),
+    ],
+)
+def test_mistakes_are_one_line(point_suite, capsys, arguments, message):
+    rl.main([*point_suite, "160", "--out", "run"])
+    rl.Path("damaged").mkdir()
+    rl.Path("damaged/last.pt").write_bytes(b"no checkpoint")
+    with pytest.raises(SystemExit, match="2"):
+        command_line(lambda: rl.main([*point_suite, "160", *arguments]))
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_meta_worlds_state_hides_the_goal_alone():
+    from metaworld_env import MetaWorldPointCloudEnv
+
+    env = MetaWorldPointCloudEnv("push")
+    env.begin(0)
+    state = env.hidden_goal_state()
+    assert state.shape == (39,) and state.dtype == np.float32
+    np.testing.assert_array_equal(state[:36], np.float32(env.expert_observation[:36]))
+    assert not state[36:].any() and env.expert_observation[36:].any()
+
+
+def test_a_simulator_without_such_states_is_refused():
+    class Blind(PointSimulator):
+        def make(self, task, num_points):
+            return object()
+
+    with pytest.raises(UserError, match="use --suite ml10"):
+        rl.environment(Blind(), "move")
