@@ -464,11 +464,15 @@ def evaluate_checkpoint(
 
     any_step: Successes = {task: [] for task in recordings}
     at_end: Successes = {task: [] for task in recordings}
-    for job, episodes_of_job in zip(jobs, job_episodes):
+    other_task: Successes = {}
+    for job, (episodes_of_job, of_other_task) in zip(jobs, job_episodes):
+        task = job["task"]
         for steps in episodes_of_job:
-            any_step[job["task"]].append(any(steps))
-            at_end[job["task"]].append(steps[-1])
-    return Outcomes(any_step, None if stop_at_success else at_end)
+            any_step[task].append(any(steps))
+            at_end[task].append(steps[-1])
+        for steps in of_other_task:
+            other_task.setdefault(task, []).append(any(steps))
+    return Outcomes(any_step, None if stop_at_success else at_end, other_task or None)
 
 
 def prepare_worker(
@@ -489,8 +493,12 @@ def rollout_job(
     inner_steps: int,
     support: int | None,
     stop_at_success: bool,
-) -> list[list[bool]]:
-    """`rollout` of the episodes of these seeds, of one task, in a worker process."""
+) -> tuple[list[list[bool]], list[list[bool]]]:
+    """`rollout` of the episodes of these seeds, of one task, in a worker process.
+
+    Returns for each episode whether each step was a success, and the same of the pair's other task
+    where tasks are pairs, see unnamed_tasks.py; elsewhere no episode.
+    """
     device = worker_state["policy"].normalizer.action_scale.device
     feature = torch.from_numpy(text).to(device)  # (text_dim,)
     if worker_state["task"] != task:
@@ -513,9 +521,10 @@ def rollout_job(
             worker_state["simulator"].make(task, policy.config.num_points)
         )
 
+    environments = worker_state["environments"][: len(seeds)]
     successes = rollout(
         policy,
-        environments=worker_state["environments"][: len(seeds)],
+        environments=environments,
         seeds=seeds,
         sampler=worker_state["sampler"],
         text=feature,
@@ -526,7 +535,8 @@ def rollout_job(
     )
     skipped = len(seeds) * worker_state["simulator"].episode_steps - sum(map(len, successes))
     report_progress(task, skipped)  # the steps after a success that ended an episode
-    return successes
+    others = [env.other_successes for env in environments if hasattr(env, "other_successes")]
+    return successes, others
 
 
 # ---- Without a simulator: held-out episodes ------------------------------------------------------

@@ -34,6 +34,7 @@ class Outcomes:
 
     any_step: Successes  # whether any step of an episode reported success
     at_end: Successes | None  # whether the last one did; None: not measured
+    other_task: Successes | None = None  # whether any step did the other task of a pair
 
 
 # ---- Numbers -------------------------------------------------------------------------------------
@@ -196,28 +197,35 @@ def write_report(
 
     Args:
         folder: it is made if it does not exist.
-        outcomes: label -> results; each makes a column of successes at any step, and one of
-            successes at the end if those were measured.
+        outcomes: label -> results; each makes a column of successes at any step, one of those at
+            the end if they were measured, and one of those at the other task if tasks are pairs.
         parts, paper: see `success_table`.
         provenance: how the results were measured, name -> value; "title" is the chart's.
         checkpoints: label -> results of other checkpoints; they go only into success.json.
         pooled: table and chart put the episodes of all tasks together: a row for each label.
     """
-    any_step = {label: outcome.any_step for label, outcome in outcomes.items()}
-    at_end = {
-        label: outcome.at_end for label, outcome in outcomes.items() if outcome.at_end is not None
-    }
+    kinds = {"any step": {}, "at the end": {}, "the other task": {}}  # -> label -> successes
+    for label, outcome in outcomes.items():
+        of_kinds = (outcome.any_step, outcome.at_end, outcome.other_task)
+        for kind, successes in zip(kinds, of_kinds):
+            if successes is not None:
+                kinds[kind][label] = successes
     if pooled:
-        columns = {"any step": pool_tasks(any_step)}
-        if at_end:
-            columns["at the end"] = pool_tasks(at_end)
+        columns = {kind: pool_tasks(of_kind) for kind, of_kind in kinds.items() if of_kind}
         table = success_table(columns, parts={}, first_title="success, percent")
     else:
-        columns = dict(any_step)
-        for label, successes in at_end.items():
-            columns[f"{label}, at the end"] = successes
+        columns = {}
+        for kind, of_kind in kinds.items():
+            for label, successes in of_kind.items():
+                columns[label if kind == "any step" else f"{label}, {kind}"] = successes
         table = success_table(columns, parts, paper)
-    report = {"provenance": provenance, "successes": any_step, "successes at the end": at_end}
+    report = {
+        "provenance": provenance,
+        "successes": kinds["any step"],
+        "successes at the end": kinds["at the end"],
+    }
+    if kinds["the other task"]:
+        report["successes at the other task"] = kinds["the other task"]
     if checkpoints:
         report["checkpoints"] = {label: outcome.any_step for label, outcome in checkpoints.items()}
     note = ", ".join(f"{name} {value}" for name, value in provenance.items())
@@ -245,8 +253,9 @@ def read_outcomes(folder: Path) -> dict[str, Outcomes]:
     """The results that `write_report` wrote to a folder: label -> outcomes."""
     written = json.loads((folder / "success.json").read_text())
     at_end = written["successes at the end"]
+    other_task = written.get("successes at the other task", {})
     return {
-        label: Outcomes(any_step, at_end.get(label))
+        label: Outcomes(any_step, at_end.get(label), other_task.get(label))
         for label, any_step in written["successes"].items()
     }
 

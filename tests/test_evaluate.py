@@ -313,6 +313,27 @@ def test_each_task_has_its_own_environments_and_its_first_demonstrations(
     assert made == [("touch-red", 64)] * 10 + [("touch-green", 64)] * 10  # kept between jobs
 
 
+def test_of_pairs_it_is_told_how_often_the_other_task_was_done(run, recordings, monkeypatch):
+    class Pairs(ToySimulator):
+        def make(self, task, num_points):
+            environment = super().make(task, num_points)
+            environment.other_successes = [False, task == "touch-red", False]
+            return environment
+
+    monkeypatch.setattr(evaluate, "rollout", lambda policy, *, seeds, **_: [[True]] * len(seeds))
+    outcomes = evaluate.evaluate_checkpoint(
+        run / "ema-00006.pt",
+        Pairs(),
+        {task: recordings[task] for task in TASKS},
+        dict.fromkeys(TASKS, torch.zeros(512)),
+        episodes=2,
+    )
+    assert outcomes.other_task == {"touch-red": [True] * 2, "touch-green": [False] * 2}
+    report.write_report(evaluate.Path("pairs"), {"a": outcomes}, {}, pooled=True)
+    assert report.read_outcomes(evaluate.Path("pairs")) == {"a": outcomes}
+    assert "the other task" in evaluate.Path("pairs/success.md").read_text()
+
+
 def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordings, monkeypatch):
     frames = []
 
