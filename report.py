@@ -78,12 +78,13 @@ def mean_interval(values: Sequence[float]) -> str:
 # ---- The paper's results -------------------------------------------------------------------------
 
 PAPER_RESULTS = Path(__file__).parent / "assets" / "paper_results.json"
-PAPER_NAMES = {  # PolicyConfig.policy -> what the paper's tables call it
+PAPER_NAMES = {  # PolicyConfig.policy, or "rl" of rl.py -> what the paper's tables call it
     "dami": "DAMI",
     "dp3": "DP3",
     "flow": "FlowPolicy",
     "mamba": "Mamba",
     "freq": "FreqPolicy",
+    "rl": "Meta-World",
 }
 
 
@@ -92,7 +93,7 @@ def paper_columns(suite: str, policies: Iterable[str]) -> PaperColumns:
 
     Args:
         suite: "ml10" or "ml45"; the paper has nothing of any other.
-        policies: names as in `PolicyConfig.policy`; those that the paper does not have are skipped.
+        policies: keys of PAPER_NAMES; others, which the paper does not have, are skipped.
 
     Returns:
         "paper, DAMI" -> task -> success rate in percent, for base and novel tasks.

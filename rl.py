@@ -58,7 +58,7 @@ from common import (
 )
 from data import write_atomically, write_text
 from maml import Params, adapt, meta_gradient
-from report import Outcomes, write_report
+from report import Outcomes, paper_columns, write_report
 from simulator import EPISODE_SEEDS, Simulator, episode_seed, evaluation_seed, simulator_of
 
 Batch = dict[str, Tensor]  # "states" (B, S), "actions" (B, A), "advantages" (B,)
@@ -578,7 +578,7 @@ def measure(
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Trains MAML-TRPO on a suite and measures it.")
     parser.add_argument("--suite", default="ml10", help="ml10 or ml45 (ml10)")
-    parser.add_argument("--out", help="folder of the run (runs/SUITE-rl-seedN)")
+    parser.add_argument("--out", help="folder of the run (runs/rl-SUITE-seedN)")
     parser.add_argument("--resume", action="store_true", help="go on with the run in --out")
     parser.add_argument("--workers", type=int, help="processes that roll out (one a core)")
     add_settings(parser, Settings, {"default": Settings()})
@@ -589,7 +589,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parse(argv)
     settings = with_flags(Settings(), args)
     simulator = simulator_of(args.suite)
-    folder = Path(args.out or f"runs/{args.suite}-rl-seed{settings.seed}")
+    folder = Path(args.out or f"runs/rl-{args.suite}-seed{settings.seed}")
     checkpoint = folder / "last.pt"
     torch.set_num_threads(1)  # the other cores have workers
 
@@ -616,7 +616,8 @@ def main(argv: Sequence[str] | None = None) -> None:
                 "seed": settings.seed,
                 **provenance("rl.py", argv, "cpu"),
             },
-            parts={"base": base_tasks, "novel": novel_tasks},
+            parts={"mean of base": base_tasks, "mean of novel": novel_tasks},
+            paper=paper_columns(args.suite, ["rl"]),
         )
     print(table)
 

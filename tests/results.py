@@ -36,6 +36,7 @@ from report import (
     plot_success,
     pooled_success,
     save_png,
+    success_table,
     wilson_interval,
 )
 from simulator import simulator_of
@@ -86,7 +87,7 @@ SWAPPED = {  # a run -> its panel in the swap chart
     "ml10-no-inner-loop-cpu-seed0": "what ships",
 }
 POLICIES = {  # of baselines.py -> what the paper calls it
-    policy: name for policy, name in PAPER_NAMES.items() if policy != "dami"
+    policy: name for policy, name in PAPER_NAMES.items() if policy not in ("dami", "rl")
 }
 ABLATION = {  # a row of the paper's ablation -> our variant, and what it is
     "baseline": ("baseline", "an MLP for VMT, no TCFM: the paper's Baseline"),
@@ -154,9 +155,9 @@ Results = dict[str, dict[str, Any]]  # a run's name -> "training", and its repor
 def take(results: Results, run: Path) -> None:
     """Adds a run's training and the reports beside its folder to `results`.
 
-    A folder of `tests.controls`, which trains nothing, is its own report.
+    A folder of `tests.controls`, which trains nothing, and one of rl.py are their own reports.
     """
-    if (run / "success.json").exists() and not (run / "metrics.jsonl").exists():
+    if (run / "success.json").exists() and not (run / "config.json").exists():
         results[run.name] = {"novel": read_report(run)}
         return
     steps = [line for line in read_json_lines(run / "metrics.jsonl") if "loss" in line]
@@ -497,6 +498,19 @@ def hidden_goals_table(results: Results, skill: str) -> str:
     return format_table(rows)
 
 
+def reinforcement_table(results: Results) -> str:
+    """MAML-TRPO by task and on the average, before and after its inner step, beside the paper's."""
+    titles = {"before": "no step", "after one inner step": "one inner step"}
+    columns = {}
+    for label, title in titles.items():
+        for at_end in (False, True):
+            column = Column("novel", label, at_end=at_end)
+            successes = measured(results["rl-ml10-seed0"], column)
+            columns[f"{title}, at the end" if at_end else title] = successes
+    parts = {f"mean of {split}": TASKS["ml10"][split] for split in ("base", "novel")}
+    return success_table(columns, parts, paper_columns("ml10", ["rl"]))
+
+
 TABLES: dict[str, Callable[[Results], str]] = {
     "means": means_table,
     "base": lambda results: by_task_table(results, "base"),
@@ -513,6 +527,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "ml45 novel": lambda results: by_task_table(results, "novel", "ml45"),
     "looks": looks_table,
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
+    "reinforcement": reinforcement_table,
     "swap": swap_table,
     "reading": reading_table,
 }
