@@ -398,7 +398,7 @@ def meta_train(
     Yields:
         Figures of each outer step: loss, gradient_norm and lr. Where there is an inner step, loss
         is the query loss after it; every tenth such step has the query loss before it as well,
-        loss_before.
+        loss_before. Where rates of the inner step are learned, inner_lr is their geometric mean.
 
     Raises:
         UserError: the loss or its gradient is not finite. The step changed nothing then.
@@ -454,6 +454,8 @@ def meta_train(
             for x in (*figures.values(), *gradients.values(), *log_rate_gradients.values()):
                 dist.all_reduce(x.mul_(len(my_places) / len(places)))
 
+        if state.log_rates:
+            figures["inner_lr"] = torch.stack(list(state.log_rates.values())).mean().exp()
         figures["gradient_norm"] = torch.nn.utils.get_total_norm(gradients.values())
         if not torch.isfinite(figures["loss"] + figures["gradient_norm"]):
             raise UserError(

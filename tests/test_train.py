@@ -335,6 +335,7 @@ def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_writ
             assert torch.allclose(end, torch.full_like(end, -1))
     plain = plain_meta_training(copy.deepcopy(policy), samplers, text, settings)
     training = train.meta_train(state, samplers, text, settings)
+    mean_rate = settings.inner_lr
     for k, expected, figures in zip(range(4), plain, training):
         theta, averaged, log_rates, loss, before, norm = expected
         assert state.step == k + 1 and figures["loss"] == pytest.approx(loss, rel=1e-9)
@@ -346,6 +347,10 @@ def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_writ
             assert torch.allclose(parameter, theta[name], atol=1e-9), (k, name)
         for name, parameter in average.named_parameters():
             assert torch.allclose(parameter, averaged[name], atol=1e-9), (k, name)
+        if learned:  # the mean of the rates that this step used, which start as one
+            assert figures["inner_lr"] == pytest.approx(mean_rate, rel=1e-9)
+            mean_rate = float(np.exp(np.mean([x.item() for x in log_rates.values()])))
+        assert ("inner_lr" in figures) == learned
         assert state.log_rates.keys() == (log_rates.keys() if learned else set())
         for name, log_rate in state.log_rates.items():
             assert torch.allclose(log_rate, log_rates[name], atol=1e-9), (k, name)
