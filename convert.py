@@ -5,6 +5,7 @@
     python convert.py --import stir.zarr --instruction "Stir the soup."    # a replay buffer of DP3
     python convert.py --import folder/of/dataset --camera camera.json      # a dataset of LeRobot
     python convert.py --import demo.hdf5 --feature obs/front_depth ...     # robomimic, ManiSkill
+    python convert.py --import folder/of/dataset --out data                # a data set of RLBench
 
 Each format has one reader (`FORMATS`), which yields frames and says what the source tells about
 itself: how many frames and episodes there must be, and at which rate. `assemble` then does the same
@@ -19,6 +20,11 @@ observation.state, action and either a cloud or depth: an array, a TIFF, or a 12
 
 **HDF5** of robomimic (data/demo_0 ...) and ManiSkill (traj_0 ...): actions, arrays that --state
 names, and a cloud or depth.
+
+**RLBench**: a data set, a task or a variation, as `rlbench-generate-dataset` writes them, and what
+is called `all_variations`. Points, states and actions are those of rlbench_data.py. A recording is
+named by its task, and those of a task's further variations by `TASK-variation1`. Episodes are
+counted through all folders, in their order.
 
 A cloud is (N, 3 or more), (3 or more, N) or an image (H, W, 3 or more) of positions in metres.
 Depth (H, W) needs its unit and the camera's intrinsics, from the data set or from --camera, see
@@ -39,11 +45,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
+import rlbench_data
 from common import UserError, command_line, progress_bar
 from data import (
     Demonstrations,
@@ -171,6 +179,7 @@ class Options:
     state: list[str] | None  # the arrays that make a state, of HDF5
     skip: frozenset[int]  # episodes that are left out
     camera: Camera
+    wrist: bool = False  # of RLBench: the camera at the wrist, too
 
 
 @dataclass(frozen=True)
@@ -185,6 +194,7 @@ class Frame:
     state: np.ndarray  # (S,)
     action: np.ndarray  # (A,)
     cloud: Callable[[], np.ndarray]  # makes (M, P); positions may be NaN, colors stand in 3 to 5
+    name: str | None = None  # of the task; None: it is made of the instruction
 
 
 @dataclass(frozen=True)
@@ -198,6 +208,7 @@ class Source:
     fps: float | None = None
     unread: tuple[str, ...] = ()  # the arrays that the reader does not read
     left_out: tuple[str, ...] = ()  # what else it leaves out, as the line about a file says it
+    meta: dict[str, Any] = field(default_factory=dict)  # what a recording's `meta` says of it
 
 
 # ---- Clouds and depth ----------------------------------------------------------------------------
@@ -993,6 +1004,82 @@ class HDF5:
         return np.concatenate([points[:, :3], colors], axis=1).astype(np.float32)
 
 
+# ---- RLBench -------------------------------------------------------------------------------------
+
+
+def read_rlbench(path: Path, options: Options) -> Source:
+    """A data set of RLBench, or one of its tasks or variations."""
+    camera = options.camera
+    if (camera.intrinsics, camera.depth_scale, camera.camera_to_base) != (None, None, None):
+        refuse(path, "says itself how its cameras stand: of --camera only the crop box is used")
+    low, high = rlbench_data.WORKSPACE
+    workspace = [list(camera.crop_low_m or low), list(camera.crop_high_m or high)]
+    cameras = [*rlbench_data.CAMERAS, *([rlbench_data.WRIST] if options.wrist else [])]
+
+    episodes = rlbench_data.find_episodes(path)
+    folders = {entry.name for entry in episodes[0].folder.iterdir() if entry.is_dir()}
+    unread = folders - {f"{name}_depth" for name in cameras}
+    return Source(
+        frames=rlbench_frames(episodes, cameras, workspace, options.instruction),
+        total_episodes=len(episodes),
+        unread=tuple(sorted(unread)),
+        left_out=("the last frame of each episode, after which nothing is done",),
+        meta={**rlbench_data.RECIPE, "cameras": cameras, "workspace": workspace},
+    )
+
+
+def rlbench_frames(
+    episodes: list[rlbench_data.EpisodeFolder],
+    cameras: list[str],
+    workspace: list[list[float]],
+    instruction: str | None,
+) -> Iterator[Frame]:
+    """The frames of all episodes but the last of each; `instruction` is the one of --instruction.
+
+    The action of a frame is what leads to the next one.
+    """
+    tasks: dict[str, int] = {}  # name -> its number
+    for number, episode in enumerate(episodes):
+        moments = rlbench_data.read_moments(episode)
+        if len(moments) < 2:
+            refuse(episode.folder, "has a single frame, so that nothing is done in it")
+        files = {
+            camera: rlbench_data.depth_files(episode, camera, len(moments)) for camera in cameras
+        }
+        variation = rlbench_data.read_variation(episode, moments)
+        name = rlbench_data.task_name(episode.task, variation)
+        task = tasks.setdefault(name, len(tasks))
+        described = None if instruction else rlbench_data.read_instruction(episode)
+        for i, (moment, following) in enumerate(pairwise(moments)):
+            yield Frame(
+                episode=number,
+                index=i,
+                time=None,
+                task=task,
+                instruction=described,
+                state=moment.state,
+                action=rlbench_data.action_between(moment.state, following.state),
+                cloud=partial(
+                    rlbench_cloud,
+                    moment,
+                    {camera: files[camera][i] for camera in cameras},
+                    workspace,
+                ),
+                name=name,
+            )
+
+
+def rlbench_cloud(
+    moment: rlbench_data.Moment, files: dict[str, Path], workspace: list[list[float]]
+) -> np.ndarray:
+    """What the cameras see, of a frame's depth images: camera -> file."""
+    views = [
+        rlbench_data.read_view(file, moment.misc, camera, rlbench_data.read_depth(file))
+        for camera, file in files.items()
+    ]
+    return rlbench_data.seen_points(views, workspace)
+
+
 # ---- The formats ---------------------------------------------------------------------------------
 
 
@@ -1016,6 +1103,7 @@ class Format:
 FORMATS = (  # the first that recognizes a path reads it
     Format("LeRobot", lambda path: (path / "meta" / "info.json").is_file(), read_lerobot),
     Format("HDF5", is_hdf5, read_hdf5),
+    Format("RLBench", rlbench_data.is_data_set, read_rlbench),
     Format("DP3", lambda path: True, read_zarr),
 )
 
@@ -1030,6 +1118,7 @@ class Episode:
     number: int  # what the source calls it
     task: int
     instruction: str
+    name: str | None = None  # of the task, where the source says it
     clouds: list[np.ndarray | None] = field(default_factory=list)  # None: nothing was seen
     states: list[np.ndarray] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)
@@ -1038,11 +1127,12 @@ class Episode:
 
 def assemble(
     path: Path, source: Source, options: Options, *, num_points: int, incomplete: bool
-) -> tuple[dict[str, list[Episode]], list[str]]:
+) -> tuple[list[list[Episode]], list[str]]:
     """Reads all frames, and checks and cleans them: the one way from a reader to a recording.
 
-    Returns the episodes of each instruction, in the order of the source, and what is left out of
-    all of them. Raises RecordingError where the source contradicts itself or lacks something.
+    Returns the episodes of each task, in the order of the source, and what is left out of all of
+    them. A task is what has one instruction, and one name where the source says names. Raises
+    RecordingError where the source contradicts itself or lacks something.
     """
     episodes, lengths = read_episodes(path, source, options, num_points)
     notes = list(source.left_out)
@@ -1065,10 +1155,10 @@ def assemble(
         fill_empty(path, episode)
     if options.color is not None:
         scale_colors(path, episodes)
-    tasks: dict[str, list[Episode]] = {}
+    tasks: dict[tuple[str | None, str], list[Episode]] = {}
     for episode in episodes:
-        tasks.setdefault(episode.instruction, []).append(episode)
-    return tasks, notes
+        tasks.setdefault((episode.name, episode.instruction), []).append(episode)
+    return list(tasks.values()), notes
 
 
 def read_episodes(
@@ -1087,7 +1177,7 @@ def read_episodes(
                 check_order(path, frame, None if first else previous, source.fps)
                 if first or frame.task != previous.task:
                     instruction = choose_instruction(path, frame, options.instruction)
-                    episodes.append(Episode(frame.episode, frame.task, instruction))
+                    episodes.append(Episode(frame.episode, frame.task, instruction, frame.name))
                     if options.instruction and frame.task != episodes[0].task:
                         refuse(path, "holds several tasks: leave --instruction out")
                 add_frame(path, episodes[-1], frame, options, num_points)
@@ -1267,6 +1357,7 @@ def read_options(args: argparse.Namespace) -> Options:
         state=args.state,
         skip=frozenset(args.skip),
         camera=camera,
+        wrist=args.wrist,
     )
 
 
@@ -1288,25 +1379,36 @@ def import_recordings(args: argparse.Namespace) -> None:
             path, f"holds {len(tasks)} tasks, which are named by what they say: leave --task out"
         )
 
+    meta = {
+        **source.meta,
+        "imported_from": path.name,
+        "num_points": args.num_points,
+        "positions_in_state": source.meta.get("positions_in_state", 0),
+    }
+    if args.positions_in_state is not None:
+        meta["positions_in_state"] = args.positions_in_state
     recordings = {}
-    for name, (instruction, episodes) in zip(task_names(tasks, args.task), tasks.items()):
+    for name, episodes in zip(task_names(tasks, args.task), tasks):
         file = Path(args.out or "recordings") / f"{name}.npz"
         if file.exists():
             other = "another --out" if len(tasks) > 1 else "another --task or --out"
             refuse(file, f"already exists: move it, or use {other}")
-        meta = {"imported_from": path.name, "positions_in_state": args.positions_in_state}
-        recordings[file] = to_recording(path, name, instruction, episodes, meta)
-    for (file, recording), episodes in zip(recordings.items(), tasks.values()):
+        recordings[file] = to_recording(path, name, episodes, meta)
+    for (file, recording), episodes in zip(recordings.items(), tasks):
         save_demonstrations(file, recording)
         print(describe(file, recording, episodes, notes))
         print_suspicions(file, recording)
 
 
-def task_names(instructions: dict[str, Any], given: str | None) -> list[str]:
-    """A name for each instruction, made of its words; the second of two equal ones ends in 2."""
+def task_names(tasks: list[list[Episode]], given: str | None) -> list[str]:
+    """A name for each task, the source's or else made of the words of its instruction.
+
+    The second of two equal ones ends in 2.
+    """
     names: list[str] = []
-    for instruction in instructions:
-        name = given or re.sub(r"\W+", "-", instruction.lower()).strip("-")[:60] or "task"
+    for episode, *_ in tasks:
+        words = re.sub(r"\W+", "-", episode.instruction.lower()).strip("-")[:60]
+        name = given or episode.name or words or "task"
         number, unique = 1, name
         while unique in names:
             number += 1
@@ -1316,7 +1418,7 @@ def task_names(instructions: dict[str, Any], given: str | None) -> list[str]:
 
 
 def to_recording(
-    path: Path, name: str, instruction: str, episodes: list[Episode], meta: dict[str, Any]
+    path: Path, name: str, episodes: list[Episode], meta: dict[str, Any]
 ) -> Demonstrations:
     """The episodes of a task, one after the other, checked."""
     for part in ("states", "actions"):
@@ -1326,7 +1428,7 @@ def to_recording(
     clouds = [cloud for episode in episodes for cloud in episode.clouds]
     recording = Demonstrations(
         task=name,
-        instruction=instruction,
+        instruction=episodes[0].instruction,
         points=as_float16(path, np.stack(clouds)),
         state=np.float32([state for episode in episodes for state in episode.states]),
         action=np.float32([action for episode in episodes for action in episode.actions]),
@@ -1395,18 +1497,18 @@ POSITIONS_HELP = (
     "how many points x, y, z a state begins with, in metres and in the frame of the points: 1 for "
     "a pose (x, y, z, then a rotation and a gripper) whose actions begin with the change of x, y, "
     "z; 0 for joint angles, or if unsure. Augmentation moves these with the points; rotations stay "
-    "as they are, wrong by up to 10 degrees (0)"
+    "as they are, wrong by up to 10 degrees (0; of RLBench 1, and rotations turn with the points)"
 )
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
-        description="Draws or checks a recording, or imports those of DP3, LeRobot or HDF5."
+        description="Draws or checks recordings, or imports those of DP3, LeRobot, HDF5 or RLBench."
     )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--show", metavar="FILE", help="draw an episode of a recording")
     what.add_argument("--check", metavar="PATH", help="say what looks wrong in a file or folder")
-    what.add_argument("--import", dest="import_", metavar="PATH", help="of DP3, LeRobot or HDF5")
+    what.add_argument("--import", dest="import_", metavar="PATH", help="other projects' recordings")
     parser.add_argument("--out", help="picture (FILE with .png), or folder of files (recordings)")
     add = parser.add_argument_group("to show").add_argument
     add("--episode", type=int, default=0, help="which (default: 0, the first)")
@@ -1414,13 +1516,14 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--instruction", help="what is done, a sentence (default: the data set's own)")
     add("--task", help="its name, and the file's (default: made of the instruction)")
     add("--num-points", type=int, default=512, help="points that are kept of a cloud (512)")
-    add("--positions-in-state", type=int, default=0, help=POSITIONS_HELP)
+    add("--positions-in-state", type=int, help=POSITIONS_HELP)
     add("--feature", metavar="NAME", help="the clouds or depth, if there are several")
     add("--state", metavar="NAME", nargs="+", help="of HDF5: the arrays of a state, in order")
     add("--camera", metavar="JSON", help="intrinsics, and its pose and crop box: convert.Camera")
     add("--depth-unit", metavar="UNIT", help="of depth: mm, m, or metres a unit, such as 0.0001")
     color = "keep colors, from 0 to 1; the name of their image, if there are several"
     add("--color", metavar="NAME", nargs="?", const="", help=color)
+    add("--wrist", action="store_true", help="of RLBench: use the camera at the wrist, too")
     add("--skip", metavar="EPISODE", type=int, nargs="+", default=[], help="leave these out")
     add("--incomplete", action="store_true", help="though frames or episodes are missing")
     return parser.parse_args(argv)

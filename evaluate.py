@@ -171,6 +171,7 @@ def rollout(
     text: Tensor,
     generator: torch.Generator,
     demonstration_control: str | None = None,
+    reference: int | None = None,
     stop_at_success: bool = False,
     on_steps: Callable[[int], None] | None = None,
 ) -> list[list[bool]]:
@@ -187,6 +188,7 @@ def rollout(
         generator: draws demonstrations and noise; on the CPU.
         demonstration_control: what the policy reads in place of its demonstration, a key of
             DEMONSTRATION_CONTROLS; None: the demonstration.
+        reference: the demonstration that all rollouts hold; None: each draws its own.
         stop_at_success: an episode ends at its first success, and not when it is over.
         on_steps: called with the number of steps that the episodes took since its last call.
 
@@ -199,10 +201,11 @@ def rollout(
     # Each rollout holds one reference demonstration. All are drawn before any noise is, and they
     # are encoded one at a time, since they may differ in length.
     contexts = []
-    demonstrations = [
-        sampler.demonstration(sampler.sample_episode(generator)) for _ in environments
-    ]
-    for demonstration in demonstrations:
+    if reference is None:
+        references = [sampler.sample_episode(generator) for _ in environments]
+    else:
+        references = [reference for _ in environments]
+    for demonstration in map(sampler.demonstration, references):
         if demonstration_control is not None:
             demonstration = DEMONSTRATION_CONTROLS[demonstration_control](demonstration)
         with torch.no_grad():
@@ -431,25 +434,32 @@ def evaluate_checkpoint(
     Returns:
         The successes, in the order of the episodes. They do not depend on `workers`.
     """
+    episodes_a_job = 1 if getattr(simulator, "one_environment", False) else EPISODES_A_JOB
+    reference_seed = seed if getattr(simulator, "one_demonstration", False) else None
     jobs = []
     for task, recording in recordings.items():
         if known_goals:
-            demonstrated = load_demonstrations(recording).meta["episode_seeds"]
+            demonstrated = load_demonstrations(recording).meta.get("episode_seeds")
+            if demonstrated is None:
+                raise UserError(
+                    f"--known-goals: {recording} does not say the seeds of its episodes"
+                )
             seeds = demonstrated[:n_demonstrations][:episodes]
         else:
             seeds = [evaluation_seed(seed, episode) for episode in range(episodes)]
-        for start in range(0, len(seeds), EPISODES_A_JOB):
+        for start in range(0, len(seeds), episodes_a_job):
             jobs.append(
                 {
                     "task": task,
                     "recording": recording,
                     "n_demonstrations": n_demonstrations,
                     "text": text[task].cpu().numpy(),  # tensors would be shared, not copied
-                    "seeds": seeds[start : start + EPISODES_A_JOB],
+                    "seeds": seeds[start : start + episodes_a_job],
                     "demonstration_control": demonstration_control,
                     "inner_steps": inner_steps,
                     "support": support,
                     "stop_at_success": stop_at_success,
+                    "reference_seed": reference_seed,
                 }
             )
     job_episodes = run_jobs(
@@ -493,8 +503,11 @@ def rollout_job(
     inner_steps: int,
     support: int | None,
     stop_at_success: bool,
+    reference_seed: int | None = None,
 ) -> tuple[list[list[bool]], list[list[bool]]]:
     """`rollout` of the episodes of these seeds, of one task, in a worker process.
+
+    With a `reference_seed` the demonstration that it draws is held by all rollouts of the task.
 
     Returns for each episode whether each step was a success, and the same of the pair's other task
     where tasks are pairs, see unnamed_tasks.py; elsewhere no episode.
@@ -522,14 +535,19 @@ def rollout_job(
         )
 
     environments = worker_state["environments"][: len(seeds)]
+    sampler = worker_state["sampler"]
+    reference = None
+    if reference_seed is not None:
+        reference = sampler.sample_episode(torch.Generator().manual_seed(reference_seed))
     successes = rollout(
         policy,
         environments=environments,
         seeds=seeds,
-        sampler=worker_state["sampler"],
+        sampler=sampler,
         text=feature,
         generator=torch.Generator().manual_seed(seeds[0]),
         demonstration_control=demonstration_control,
+        reference=reference,
         stop_at_success=stop_at_success,
         on_steps=partial(report_progress, task),
     )

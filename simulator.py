@@ -69,11 +69,14 @@ class Simulator(Protocol):
     name: str
     instructions: dict[str, str]  # task -> what the robot is told; its order decides the seeds
     # How recordings are made: "simulator" (the name), "num_points" and more. With "success": "at
-    # the end" an expert's episode is kept only if its last step is a success, too.
+    # the end" an expert's episode is kept only if its last step is a success, too. With "made_by"
+    # there is no expert: that is a sentence of how a user makes the recordings.
     recipe: dict[str, Any]
     packages: Sequence[str]  # whose versions are written into recordings
     demonstrations: int  # of a task, unless a command says otherwise
     episode_steps: int  # after so many steps an episode is truncated
+    # Two more may be left out. With `one_environment = True` a process uses one environment at a
+    # time, and with `one_demonstration = True` all rollouts of a task hold the same demonstration.
 
     def tasks(self, suite: str) -> tuple[list[str], list[str]]:
         """Returns a suite's (base, novel) tasks: those to train on, and those to adapt to."""
@@ -114,6 +117,11 @@ def conventions() -> Simulator:
     return import_simulator("unnamed_tasks").Conventions()
 
 
+def rlbench() -> Simulator:
+    """Returns RLBench's few-shot suite; UserError says what to install where it is missing."""
+    return import_simulator("rlbench_env").RLBench()
+
+
 SIMULATORS: dict[str, Callable[[], Simulator]] = {
     "ml10": meta_world,
     "ml45": meta_world,
@@ -128,6 +136,7 @@ SIMULATORS: dict[str, Callable[[], Simulator]] = {
     "convention-push": conventions,
     "convention-reach-validation": conventions,
     "convention-push-validation": conventions,
+    "fs25": rlbench,
 }
 
 
@@ -201,7 +210,7 @@ def made_by_simulator(demonstrations: Demonstrations) -> bool:
 
 def check_recipe(demonstrations: Demonstrations, path: str | Path, recipe: dict[str, Any]) -> None:
     """Raises UserError for a recording, read from `path`, that was not made by this recipe."""
-    if not made_by_simulator(demonstrations):
+    if "simulator" in recipe and not made_by_simulator(demonstrations):
         raise UserError(
             f"{path} was recorded by an older version, or is a recording of your own: "
             "move it or use another --data"
@@ -245,8 +254,8 @@ def collect(
 
     Raises:
         UserError: an unknown task, a seed or number of episodes out of range, a folder that cannot
-            be written to, a file in it that was recorded otherwise (it is never overwritten), or an
-            expert that hardly ever succeeds.
+            be written to, a file in it that was recorded otherwise (it is never overwritten), an
+            expert that hardly ever succeeds, or a missing file of a simulator without experts.
         RecordingError: a damaged file.
     """
     folder = Path(folder)
@@ -256,8 +265,14 @@ def collect(
         raise UserError(f"--episodes is {episodes}: use {bound}")
     episode_seed(seed, 0)  # refuses a seed out of range
 
-    if not missing_tasks(simulator, paths, episodes, seed):
+    missing = missing_tasks(simulator, paths, episodes, seed)
+    if not missing:
         return paths  # the folder may be read-only
+    if "made_by" in simulator.recipe:
+        raise UserError(
+            f"{paths[missing[0]]} is missing or holds fewer than {episodes} demonstrations: make "
+            f"it by {simulator.recipe['made_by']}"
+        )
     waiting = f"another process collects into {folder}: waiting until it is done"
     with locked(folder, name=".collecting.lock", flag="--data", waiting=waiting):
         jobs = [
@@ -298,7 +313,8 @@ def missing_tasks(
             missing.append(task)
             continue
         demonstrations = load_demonstrations(path)
-        check_recipe(demonstrations, path, {**simulator.recipe, "seed": seed})
+        by_expert = {} if "made_by" in simulator.recipe else {"seed": seed}
+        check_recipe(demonstrations, path, {**simulator.recipe, **by_expert})
         if demonstrations.task != task:
             raise UserError(
                 f"{path} is a recording of {demonstrations.task}: move it or use another --data"
@@ -424,13 +440,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     rows = [["task", "episodes", "expert", "frames", "seconds", "MB"]]
     for task, path in paths.items():
         demonstrations = load_demonstrations(path)
+        expert, seconds = "", ""  # of what was imported
+        if "made_by" not in simulator.recipe:
+            expert = f"{demonstrations.meta['expert_success_rate']:.0%}"
+            seconds = f"{demonstrations.meta['seconds']:.1f}"
         rows.append(
             [
                 task,
                 len(demonstrations),
-                f"{demonstrations.meta['expert_success_rate']:.0%}",
+                expert,
                 len(demonstrations.points),
-                f"{demonstrations.meta['seconds']:.1f}",
+                seconds,
                 f"{path.stat().st_size / 1e6:.1f}",
             ]
         )
