@@ -21,6 +21,7 @@ P point_dim, A action dim, S state dim.
 import argparse
 import copy
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -100,8 +101,15 @@ def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: dict[str, Tens
     return functional_call(policy, params, (), batch)
 
 
-def inner_rate(info: dict[str, Any], device: str | torch.device) -> maml.InnerRate:
-    """The learning rate of a checkpoint's inner step: one number, or those that it learned."""
+def inner_rate(
+    info: dict[str, Any], device: str | torch.device, given: float | None = None
+) -> maml.InnerRate:
+    """The learning rate of an inner step: the given one, or what the checkpoint's training had.
+
+    That is one number, or those that it learned.
+    """
+    if given is not None:
+        return given
     learned = info.get("inner_rates")
     if not learned:
         return info["arguments"]["inner_lr"]
@@ -403,6 +411,7 @@ def evaluate_checkpoint(
     n_demonstrations: int | None = None,
     demonstration_control: str | None = None,
     inner_steps: int = 0,
+    inner_lr: float | None = None,
     support: int | None = None,
     known_goals: bool = False,
     stop_at_success: bool = False,
@@ -423,8 +432,9 @@ def evaluate_checkpoint(
         n_demonstrations: use only the first so many of each recording; None: all.
         demonstration_control: what the policy reads in place of its demonstration, a key of
             DEMONSTRATION_CONTROLS; None: the demonstration.
-        inner_steps: the policy is adapted to each task by so many steps before, with the inner rate
-            of its training; see `take_inner_steps`.
+        inner_steps: the policy is adapted to each task by so many steps before, see
+            `take_inner_steps`.
+        inner_lr: the learning rate of these steps; None: the one or those of its training.
         support: windows for these steps; None: as many as in its training.
         known_goals: roll out on the demonstrations' goals, at most `episodes` of them, each once.
         stop_at_success: an episode ends at its first success; it is quicker.
@@ -457,6 +467,7 @@ def evaluate_checkpoint(
                     "seeds": seeds[start : start + episodes_a_job],
                     "demonstration_control": demonstration_control,
                     "inner_steps": inner_steps,
+                    "inner_lr": inner_lr,
                     "support": support,
                     "stop_at_success": stop_at_success,
                     "reference_seed": reference_seed,
@@ -501,6 +512,7 @@ def rollout_job(
     seeds: list[int],
     demonstration_control: str | None,
     inner_steps: int,
+    inner_lr: float | None,
     support: int | None,
     stop_at_success: bool,
     reference_seed: int | None = None,
@@ -525,7 +537,7 @@ def rollout_job(
                 feature,
                 steps=inner_steps,
                 batch=support or info["arguments"]["support"],
-                lr=inner_rate(info, device),
+                lr=inner_rate(info, device, inner_lr),
             )
         worker_state.update(task=task, task_policy=policy, sampler=sampler, environments=[])
     policy = worker_state["task_policy"]
@@ -917,6 +929,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         default=0,
         help="adapt to each task by so many inner steps, as in training, before (default: 0)",
     )
+    add("--inner-lr", type=float, help="learning rate of these steps (default: as in training)")
     add("--support", type=int, help="windows for these steps (default: as many as in training)")
     add_inference_flags(parser)
     common.add_common_flags(parser)
@@ -935,6 +948,11 @@ def check_flags(args: argparse.Namespace) -> None:
         if value is not None and value < least:
             raise UserError(f"--{name} is {value}: use at least {least}")
     evaluation_seed(args.seed, args.episodes - 1)  # refuses what is out of range
+    for name, value in (("inner-lr", args.inner_lr), ("support", args.support)):
+        if value is not None and args.inner_steps == 0:
+            raise UserError(f"--{name} is for --inner-steps: give both")
+    if args.inner_lr is not None and not 0 <= args.inner_lr < math.inf:
+        raise UserError(f"--inner-lr is {args.inner_lr}: use a number from 0")
     if args.gif:
         movie_writer(args.gif)  # refuses what cannot be written
         if args.known_goals or "demonstration" in args.without or args.inner_steps:
@@ -1183,6 +1201,7 @@ def measure(
             n_demonstrations=args.demonstrations,
             demonstration_control=measurement.demonstration_control,
             inner_steps=args.inner_steps,
+            inner_lr=args.inner_lr,
             support=args.support,
             known_goals=args.known_goals,
             stop_at_success=args.stop_at_success,
@@ -1198,6 +1217,7 @@ def measure(
         "goals": "of the demonstrations, each once" if args.known_goals else "new",
         "left out": " and ".join(args.without) or "nothing",
         "inner steps": args.inner_steps,
+        "inner rate": "as in training" if args.inner_lr is None else args.inner_lr,
         "support": args.support or "as in training",
         "text weights": identity,
         **common.provenance("evaluate.py", argv, device),

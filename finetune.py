@@ -290,14 +290,13 @@ def adapt_checkpoint(
             seed=settings.seed,
         )
     else:
-        inner_lr = settings.inner_lr
         training = evaluate.take_inner_steps(
             policy,
             sampler,
             text,
             steps=settings.inner_steps,
             batch=settings.batch,
-            lr=evaluate.inner_rate(info, text.device) if inner_lr is None else inner_lr,
+            lr=evaluate.inner_rate(info, text.device, settings.inner_lr),
             seed=settings.seed,
         )
     seconds = 0.0

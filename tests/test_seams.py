@@ -251,3 +251,21 @@ def test_inner_steps_before_a_rollout_change_the_policy_by_its_own_rate(here, ow
         policy, sampler, text, steps=2, batch=4, lr=evaluate.inner_rate(learned, "cpu")
     )
     assert all(torch.equal(a, b) for a, b in zip(still.parameters(), policy.parameters()))
+    assert evaluate.inner_rate(learned, "cpu", given=0.2) == 0.2
+
+
+def test_evaluation_adapts_at_the_rate_that_is_given(here, own_folder, monkeypatch):
+    call(simulator, "--suite toy --episodes 2")
+    call(train, f"--suite toy --preset tiny --steps 2 --inner-lr 0.01 --out run {QUICK}")
+    rates = []
+    take_inner_steps = evaluate.take_inner_steps
+
+    def watched(*arguments, lr, **options):
+        rates.append(lr)
+        return take_inner_steps(*arguments, lr=lr, **options)
+
+    monkeypatch.setattr(evaluate, "take_inner_steps", watched)
+    for more in ("", "--inner-lr 0.5"):
+        options = f"--checkpoint run --task touch-blue --inner-steps 1 {more}"
+        call(evaluate, f"{options} --demonstrations 2 --episodes 1 --overwrite {CPU}")
+    assert rates == [0.01, 0.5]
