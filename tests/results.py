@@ -36,7 +36,6 @@ from report import (
     plot_success,
     pooled_success,
     save_png,
-    success_table,
     wilson_interval,
 )
 from simulator import simulator_of
@@ -506,19 +505,6 @@ def hidden_goals_table(results: Results, skill: str) -> str:
     return format_table(rows)
 
 
-def reinforcement_table(results: Results) -> str:
-    """MAML-TRPO by task and on the average, before and after its inner step, beside the paper's."""
-    titles = {"before": "no step", "after one inner step": "one inner step"}
-    columns = {}
-    for label, title in titles.items():
-        for at_end in (False, True):
-            column = Column("novel", label, at_end=at_end)
-            successes = measured(results["rl-ml10-seed0"], column)
-            columns[f"{title}, at the end" if at_end else title] = successes
-    parts = {f"mean of {split}": TASKS["ml10"][split] for split in ("base", "novel")}
-    return success_table(columns, parts, paper_columns("ml10", ["rl"]))
-
-
 TABLES: dict[str, Callable[[Results], str]] = {
     "means": means_table,
     "base": lambda results: by_task_table(results, "base"),
@@ -535,7 +521,6 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "ml45 novel": lambda results: by_task_table(results, "novel", "ml45"),
     "looks": looks_table,
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
-    "reinforcement": reinforcement_table,
     "swap": swap_table,
     "reading": reading_table,
 }
@@ -634,6 +619,48 @@ def plot_adaptation(results: Results, path: Path) -> None:
     save_png(figure, path, dpi=120)
 
 
+INNER_STEPS = (0, 1, 5, 20)
+ARMS = {  # of those without a demonstration encoder -> its line in the figure
+    "inner": "trained through an inner step",
+    "inner-first-order": "the same in first order",
+    "neither": "multi-task, as many outer steps, at its best rates",
+    "neither-as-long": "multi-task, as many minutes, at its best rates",
+}
+
+
+def plot_inner_steps(results: Results, skill: str, path: Path) -> None:
+    """Writes a chart of success at the end on novel goals along inner steps, a line an arm.
+
+    A dashed line is the policy that reads a demonstration, without any step.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.5, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for place, (arm, label) in enumerate(ARMS.items()):
+        rates, bounds = [], []
+        for n in INNER_STEPS:
+            report = f"{n}-steps-best-rate" if arm.startswith("neither") and n else f"{n}-steps"
+            episodes = together(results, f"goals-{skill}-{arm}", Column(report, at_end=True))
+            rates.append(100 * np.mean(episodes) if episodes else np.nan)
+            interval = wilson_interval(sum(episodes), len(episodes)) if episodes else (0, 0)
+            bounds.append(100 * np.abs(np.array(interval) - rates[-1] / 100))
+        if np.isnan(rates).all():
+            continue
+        x = np.arange(len(INNER_STEPS)) + 0.04 * (place - 1.5)  # so that no line hides another
+        axes.errorbar(x, rates, yerr=np.array(bounds).T, label=label, marker="o", capsize=2)
+    read = together(results, f"goals-{skill}-demonstration", Column("novel", 0, at_end=True))
+    if read:
+        label = "reads a demonstration, no step"
+        axes.axhline(100 * np.mean(read), color="gray", linestyle="--", label=label)
+    axes.set_xticks(range(len(INNER_STEPS)), [str(n) for n in INNER_STEPS])
+    axes.set(xlabel="steps of gradient descent on eight windows of the new goal", ylim=(-3, 103))
+    axes.set_ylabel("success at the end, %")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8, loc="center right")
+    save_png(figure, path, dpi=120)
+
+
 def plot_by_task(results: Results, path: Path) -> None:
     """Writes a chart of success by task, of all seeds together, beside the paper's."""
     columns: dict[str, Successes] = {}
@@ -718,6 +745,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         write_text(ROOT / name, fill((ROOT / name).read_text(), results))
     plot_swap(results, ROOT / "assets" / "swap.png")
     plot_by_task(results, ROOT / "assets" / "success.png")
+    plot_inner_steps(results, "reach", ROOT / "assets" / "inner-steps.png")
     if any("curve" in run for run in results.values()):
         plot_adaptation(results, ROOT / "assets" / "adaptation.png")
 
