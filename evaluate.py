@@ -53,7 +53,15 @@ from report import (
     paper_columns,
     write_report,
 )
-from simulator import Environment, Simulator, check_task, collect, evaluation_seed, simulator_of
+from simulator import (
+    Environment,
+    OutOfSightError,
+    Simulator,
+    check_task,
+    collect,
+    evaluation_seed,
+    simulator_of,
+)
 
 EVALUATION_SEED = 0  # of the goals; the same for every seed of training
 EPISODES_A_JOB = 10  # side by side in one process; with another number other noise is drawn
@@ -102,14 +110,14 @@ def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: dict[str, Tens
 
 
 def inner_rate(
-    info: dict[str, Any], device: str | torch.device, given: float | None = None
+    info: dict[str, Any], device: str | torch.device, override: float | None = None
 ) -> maml.InnerRate:
-    """The learning rate of an inner step: the given one, or what the checkpoint's training had.
+    """The learning rate of an inner step: `override`, or that of the checkpoint's training.
 
-    That is one number, or those that it learned.
+    The training has one number, or learned one for each tensor.
     """
-    if given is not None:
-        return given
+    if override is not None:
+        return override
     learned = info.get("inner_rates")
     if not learned:
         return info["arguments"]["inner_lr"]
@@ -283,6 +291,7 @@ def take_actions(
 
     Returns the observations after the last `n_observations` actions (fewer if the chunk is shorter,
     or the episode ends before), whether each step reported success, and whether the episode ended.
+    It also ends, without success, where there is nothing to observe.
     """
     seen, successes = [], []
     for i, action in enumerate(chunk):
@@ -291,7 +300,10 @@ def take_actions(
         if truncated or (stop_at_success and info["success"]):
             return seen, successes, True
         if i >= len(chunk) - n_observations:
-            seen.append(environment.observe())
+            try:
+                seen.append(environment.observe())
+            except OutOfSightError:
+                return seen, [*successes[:-1], False], True
     return seen, successes, False
 
 
@@ -706,8 +718,11 @@ class FilmedEnvironment:
         return reward, truncated, info
 
     def film(self) -> None:
-        """Keeps the present moment."""
-        cloud = positions(self.observe()["point_cloud"])
+        """Keeps the present moment, with the cloud of the moment before if nothing is seen."""
+        try:
+            cloud = positions(self.observe()["point_cloud"])
+        except OutOfSightError:
+            cloud = self.frames[-1].cloud
         self.frames.append(Frame(self.steps, self.success, self.environment.render(), cloud))
 
 

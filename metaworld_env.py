@@ -23,6 +23,7 @@ from metaworld.policies import ENV_POLICY_MAP
 from camera import RayCastCamera
 from common import choose
 from data import farthest_point_sample
+from simulator import OutOfSightError
 
 # Some experts ask for more than 1; their actions are clipped below.
 warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
@@ -241,7 +242,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         positions = np.concatenate([hand, right_finger, left_finger])  # (9,)
         return {"point_cloud": self.cloud(), "agent_pos": positions.astype(np.float32)}
 
-    def hidden_goal_state(self) -> np.ndarray:
+    def state_without_goal(self) -> np.ndarray:
         """Returns Meta-World's own observation (39,) float32, in which zeros stand for the goal.
 
         It is what Meta-World's benchmarks show to a learner: positions, of this moment and of the
@@ -253,9 +254,11 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         """Returns farthest points of what the camera sees of all but the arm, (N, 3) float32.
 
         Where it sees fewer than N points, they are repeated from the first one. Where the arm hides
-        everything else, the points are the arm's. Raises ValueError where nothing is seen.
+        everything else, the points are the arm's. Raises OutOfSightError where nothing is seen.
         """
         points, geoms = self.camera.points(self.sawyer_env.data, segmentation=True)
+        if len(points) == 0:
+            raise OutOfSightError(f"{self.task}: nothing was seen inside the workspace")
         of_arm = np.isin(geoms, self.arm_geoms)  # (M,) bool
         if not of_arm.all():
             points = points[~of_arm]

@@ -1,23 +1,23 @@
-"""The paper's reinforcement-learning baseline: MAML-TRPO, on the simulator's own states.
+"""Meta-reinforcement learning as a baseline: MAML-TRPO, on the simulator's own states.
 
     python rl.py --suite ml10               # trains for 20 million steps of the simulator, measures
     python rl.py --suite ml10 --resume      # goes on where an interrupted run stopped
 
-It is the method of Meta-World's benchmark (Yu et al. 2019), which is most probably what the paper's
-row "Meta-World" is. No demonstration, no cloud, no instruction: a small network maps a state to a
-Gaussian of actions, and rewards are what it learns from. A task is one goal of one skill, and the
-state does not show the goal: only the rewards of a few rollouts tell it.
+The paper's row "Meta-World" is most probably this method, as Meta-World's benchmark has it (Yu et
+al. 2019); the paper does not say. No demonstration, no cloud, no instruction: a small network maps
+a state to a Gaussian of actions, and learns from rewards. The state lacks the goal's coordinates,
+so where goals differ otherwise only by a marker, only the rewards of a few rollouts tell them.
 
-In each iteration, for each of some tasks (`task_job`)
+In each iteration, for each of some goals (`goal_job`), with L as in `GaussianPolicy.loss`
 
     1. rollouts with theta: the support set
-    2. theta' = theta - alpha * the policy gradient on these rollouts
+    2. theta' = theta - alpha * grad L(theta, support)
     3. rollouts with theta': the query set
 
 and then one step of TRPO (Schulman et al. 2015) on theta, through the inner step (`trpo_step`).
-Both gradients are maml.py's, which never learns what a loss is about.
+Both gradients are maml.py's, which works for any loss.
 
-Letters: R rollouts of a task, T steps of a rollout, S state dim, A action dim, F features of the
+Letters: R rollouts to a goal, T steps of a rollout, S state dim, A action dim, F features of the
 baseline, B = R * T.
 """
 
@@ -25,7 +25,7 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -66,21 +66,29 @@ Batch = dict[str, Tensor]  # "states" (B, S), "actions" (B, A), "advantages" (B,
 
 @dataclass(frozen=True)
 class Settings:
-    """What a training is made of; the defaults are those of Meta-World's benchmark."""
+    """What a training is made of.
+
+    The defaults follow Meta-World's benchmark, but for these: an episode is as long as elsewhere in
+    this project, goals are drawn anew in each iteration where the benchmark has 50 of each task,
+    and a training is shorter. The width, the damping and the standard deviation, which begins at 1
+    and is the same in all states, are our choice.
+    """
 
     seed: int = setting(0, "of weights, goals and actions", least=0, most=999)
     steps: int = setting(20_000_000, "of the simulator, in all rollouts", least=1)
-    tasks: int = setting(20, "tasks of an iteration", least=1)
-    rollouts: int = setting(10, "rollouts of a task, before and after the inner step", least=1)
+    goals: int = setting(20, "goals of an iteration", least=1)
+    rollouts: int = setting(10, "rollouts to a goal, before and after the inner step", least=1)
     hidden: int = setting(128, "width of the two hidden layers", least=1)
     inner_lr: float = setting(0.1, "learning rate of the inner step", least=0)
     discount: float = setting(0.99, "of rewards, for each step", least=0, most=1)
     gae_lambda: float = setting(1.0, "of generalized advantage estimation", least=0, most=1)
-    max_kl: float = setting(0.01, "how far an iteration moves the adapted policies", least=0)
+    max_kl: float = setting(0.01, "bound on the mean KL divergence of one iteration", least=0)
     cg_iterations: int = setting(10, "of conjugate gradients", least=1)
     damping: float = setting(1e-5, "added to the Fisher matrix's diagonal", least=0)
-    backtracks: int = setting(15, "how often the line search shortens a step", least=1)
-    backtrack_ratio: float = setting(0.8, "how much it does each time", least=0, most=1)
+    backtracks: int = setting(15, "steps that the line search tries", least=1)
+    backtrack_ratio: float = setting(
+        0.8, "factor of each step that it tries to the one before", least=0, most=1
+    )
     episodes: int = setting(20, "goals of each task that are measured", least=1)
 
     def __post_init__(self) -> None:
@@ -109,11 +117,11 @@ class GaussianPolicy(nn.Module):
         return self.mean(states), self.log_std
 
     def loss(self, params: Params, batch: Batch) -> Tensor:
-        """The loss () whose gradient is the policy gradient, of the policy with these parameters.
+        """The loss (), whose negative gradient is the policy gradient at these parameters.
 
         It serves the inner and the outer loop. TRPO's outer loss weighs each action by the ratio of
-        its probabilities under the new and the old policy, but where the two are the same, which
-        is where a gradient is taken, its gradient is this one.
+        its probabilities under the new and the old policy. A gradient is only taken where the two
+        are the same, and there the gradients of both losses are the same, too.
         """
         mean, log_std = functional_call(self, params, batch["states"])
         return -(log_probability(mean, log_std, batch["actions"]) * batch["advantages"]).mean()
@@ -130,7 +138,7 @@ def log_probability(mean: Tensor, log_std: Tensor, actions: Tensor) -> Tensor:
 
 @dataclass
 class Rollouts:
-    """R rollouts of one task: arrays (R, T, ...)."""
+    """R rollouts to one goal: arrays (R, T, ...)."""
 
     states: np.ndarray
     actions: np.ndarray
@@ -142,37 +150,46 @@ class Rollouts:
 def environment(simulator: Simulator, task: str) -> Any:
     """The environment of a task, which is made once in each process."""
     env = simulator.make(task, simulator.recipe["num_points"])
-    if not hasattr(env, "hidden_goal_state"):
-        raise UserError(
-            f"{simulator.name} tells no states without a goal: use --suite ml10 or ml45"
-        )
+    if not hasattr(env, "state_without_goal"):
+        raise UserError(f"{simulator.name} has no low-dimensional states: use --suite ml10 or ml45")
     return env
 
 
-def roll_out(env: Any, policy: GaussianPolicy, seed: int, noise: np.ndarray) -> Rollouts:
+def draw_noise(policy: GaussianPolicy, rollouts: int, steps: int, seed: tuple[int, ...]) -> Any:
+    """The standard normal numbers (R, T, A) float32 that actions are drawn with."""
+    shape = (rollouts, steps, len(policy.log_std))
+    return np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
+
+
+def roll_out(env: Any, policy: GaussianPolicy, goal_seed: int, noise: np.ndarray) -> Rollouts:
     """Rolls a policy out, always from the same start to the same goal.
 
     Args:
-        env: an environment of a simulator that has `hidden_goal_state`.
-        seed: of the episode: start and goal.
-        noise: (R, T, A) standard normal numbers that actions are drawn with; zeros give the means.
+        env: an environment that has `state_without_goal`.
+        goal_seed: of the episode: start and goal.
+        noise: (R, T, A), see `draw_noise`; zeros give the means.
     """
     std = policy.log_std.exp().detach().numpy()
-    rows = []  # of each step: state, action, reward, success
+    states, actions, rewards, successes = [], [], [], []  # of all steps, one after the other
     for noise_of_rollout in noise:
-        env.begin(seed)
+        env.begin(goal_seed)
         for noise_of_step in noise_of_rollout:
-            state = env.hidden_goal_state()
+            state = env.state_without_goal()
             with torch.inference_mode():
                 mean, _ = policy(torch.from_numpy(state))
             action = mean.numpy() + std * noise_of_step
             reward, _, info = env.advance(action)
-            rows.append((state, action, reward, info["success"]))
-    columns = [np.array(column) for column in zip(*rows)]
-    states, actions, rewards, successes = (
-        x.reshape(*noise.shape[:2], *x.shape[1:]) for x in columns
+            states.append(state)
+            actions.append(action)
+            rewards.append(reward)
+            successes.append(info["success"])
+    R, T, A = noise.shape
+    return Rollouts(
+        states=np.array(states).reshape(R, T, -1),
+        actions=np.array(actions).reshape(R, T, A),
+        rewards=np.array(rewards).reshape(R, T),
+        successes=np.array(successes).reshape(R, T),
     )
-    return Rollouts(states, actions, rewards, successes)
 
 
 def discounted_sums(x: np.ndarray, discount: float) -> np.ndarray:
@@ -202,15 +219,16 @@ def baseline_values(rollouts: Rollouts, returns: np.ndarray) -> np.ndarray:
 
 
 def to_batch(rollouts: Rollouts, settings: Settings) -> Batch:
-    """The states and actions of rollouts, with how much better than usual each action was.
+    """The states and actions of rollouts, with the advantages of the actions.
 
-    Generalized advantage estimation (Schulman et al. 2016), made to have mean 0 and deviation 1.
+    Those are of generalized advantage estimation (Schulman et al. 2016), with mean 0 and standard
+    deviation 1.
     """
     rewards = rollouts.rewards
     values = baseline_values(rollouts, discounted_sums(rewards, settings.discount))
     next_values = np.concatenate([values[:, 1:], np.zeros((len(values), 1))], axis=1)
-    surprises = rewards + settings.discount * next_values - values
-    advantages = discounted_sums(surprises, settings.discount * settings.gae_lambda)
+    deltas = rewards + settings.discount * next_values - values
+    advantages = discounted_sums(deltas, settings.discount * settings.gae_lambda)
     advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     batch = {
         "states": rollouts.states.reshape(-1, rollouts.states.shape[-1]),
@@ -221,7 +239,7 @@ def to_batch(rollouts: Rollouts, settings: Settings) -> Batch:
 
 
 def adapted_policy(policy: GaussianPolicy, support: Batch, settings: Settings) -> GaussianPolicy:
-    """The policy after one inner step on the rollouts of a task."""
+    """The policy after one inner step on rollouts to a goal."""
     params = dict(policy.named_parameters())
     adapted = GaussianPolicy(*policy_shape(policy))
     with torch.no_grad():
@@ -238,25 +256,50 @@ def policy_shape(policy: GaussianPolicy) -> tuple[int, int, int]:
 # ---- One iteration -------------------------------------------------------------------------------
 
 
-def task_job(
+# What random numbers are for: streams of different purposes never have the same seed.
+ORDER, TRAINING, MEASURING = range(3)
+
+
+@dataclass
+class Sample:
+    """What is learned from some rollouts to a goal, and how they went."""
+
+    batch: Batch
+    mean_return: float
+    success: float  # the share of rollouts that were a success at any step
+
+
+def to_sample(rollouts: Rollouts, settings: Settings) -> Sample:
+    return Sample(
+        batch=to_batch(rollouts, settings),
+        mean_return=float(rollouts.rewards.sum(axis=1).mean()),
+        success=float(rollouts.successes.any(axis=1).mean()),
+    )
+
+
+def goal_job(
     simulator: Simulator,
     task: str,
     goal_seed: int,
     noise_seed: tuple[int, ...],
     policy: GaussianPolicy,
     settings: Settings,
-) -> tuple[Rollouts, Rollouts]:
-    """The rollouts of one task before and after the inner step."""
+) -> tuple[Sample, Sample]:
+    """Rollouts to one goal before and after the inner step: support and query."""
     env = environment(simulator, task)
-    _, action_dim, _ = policy_shape(policy)
-    shape = (2, settings.rollouts, simulator.episode_steps, action_dim)
-    noise = np.random.default_rng(noise_seed).standard_normal(shape, dtype=np.float32)
-    before = roll_out(env, policy, goal_seed, noise[0])
-    report_progress(task, before.rewards.size)
-    adapted = adapted_policy(policy, to_batch(before, settings), settings)
-    after = roll_out(env, adapted, goal_seed, noise[1])
-    report_progress(task, after.rewards.size)
-    return before, after
+    noise = draw_noise(policy, 2 * settings.rollouts, simulator.episode_steps, noise_seed)
+    rollouts = roll_out(env, policy, goal_seed, noise[: settings.rollouts])
+    report_progress(task, rollouts.rewards.size)
+    support = to_sample(rollouts, settings)
+    adapted = adapted_policy(policy, support.batch, settings)
+    rollouts = roll_out(env, adapted, goal_seed, noise[settings.rollouts :])
+    report_progress(task, rollouts.rewards.size)
+    return support, to_sample(rollouts, settings)
+
+
+def stack(batches: Sequence[Batch]) -> Batch:
+    """Batches of several goals as one: "states" (goals, B, S) ..."""
+    return {name: torch.stack([batch[name] for batch in batches]) for name in batches[0]}
 
 
 def flatten(params: Params) -> Tensor:
@@ -271,11 +314,11 @@ def unflatten(vector: Tensor, like: Params) -> Params:
 
 
 class AdaptedPolicies:
-    """The policies of several tasks after their inner steps, as functions of theta.
+    """The policies of several goals after their inner steps, as functions of theta.
 
     Args:
         policy: its parameters are not read.
-        support, query: the batches of the tasks, stacked: "states" (tasks, B, S) ...
+        support, query: the batches of the goals, stacked: "states" (goals, B, S) ...
         inner_lr: of the inner step.
     """
 
@@ -286,56 +329,55 @@ class AdaptedPolicies:
         self.inner_lr = inner_lr
 
     def gaussians(self, params: Params) -> tuple[Tensor, Tensor]:
-        """theta -> what the adapted policies say at the query states.
+        """theta -> the Gaussians that the adapted policies predict for the query states.
 
-        Returns means (tasks, B, A) and logarithms of standard deviations (tasks, 1, A).
+        Returns means (goals, B, A) and logarithms of standard deviations (goals, 1, A).
         """
 
-        def of_task(support: Batch, states: Tensor) -> tuple[Tensor, Tensor]:
+        def of_goal(support: Batch, states: Tensor) -> tuple[Tensor, Tensor]:
             adapted = adapt(self.policy.loss, params, support, lr=self.inner_lr)
             return functional_call(self.policy, adapted, states)
 
-        mean, log_std = vmap(of_task)(self.support, self.query["states"])
+        mean, log_std = vmap(of_goal)(self.support, self.query["states"])
         return mean, log_std[:, None]
 
-    def fisher_product(self, params: Params, damping: float) -> Any:
+    def fisher_vector_product(self, params: Params, damping: float) -> Callable[[Tensor], Tensor]:
         """The function v -> H v, vectors as `flatten` makes them.
 
         H is the second derivative, in theta, of the mean KL divergence between the adapted
-        policies at theta and at `params`; it is taken at `params`. There the first derivatives of
-        the divergence are zero, so that H = J^T M J: J is the derivative of means and log
-        deviations in theta, and M that of the divergence in those: 1 / std^2 and 2.
+        policies at theta and at `params`; it is taken at `params`. There the divergence's first
+        derivatives are zero, so that H = J^T M J. J is the derivative of the Gaussians in theta.
+        M is the divergence's second derivative in the Gaussians, and diagonal: 1 / std^2 for a
+        mean, 2 for a log deviation, each divided by how many the mean is taken over.
         """
         (_, log_std), backward = vjp(self.gaussians, params)
-        tasks, steps = self.query["advantages"].shape
+        goals, B = self.query["advantages"].shape
 
         def product(v: Tensor) -> Tensor:
             direction = unflatten(v, params)
             _, (d_mean, d_log_std) = jvp(self.gaussians, (params,), (direction,))  # J v
-            d_mean = d_mean * torch.exp(-2 * log_std) / (tasks * steps)
-            (result,) = backward((d_mean, 2 * d_log_std / tasks))
+            d_mean = d_mean * torch.exp(-2 * log_std) / (goals * B)
+            (result,) = backward((d_mean, 2 * d_log_std / goals))
             return flatten(result) + damping * v
 
         return product
 
-    def loss_and_divergence(
+    def surrogate_loss_and_kl(
         self, params: Params, old: tuple[Tensor, Tensor]
     ) -> tuple[float, float]:
-        """TRPO's outer loss at theta, and how far its adapted policies are from the old ones.
+        """TRPO's outer loss at theta, and the mean KL divergence from `old` to its Gaussians.
 
         `old` is what `gaussians` gave for the theta that the query actions were drawn with.
         """
         mean, log_std = self.gaussians(params)
-        actions = self.query["actions"]
-        ratio = torch.exp(
-            log_probability(mean, log_std, actions) - log_probability(*old, actions)
-        )  # (tasks, B)
-        loss = -(ratio * self.query["advantages"]).mean()
         old_mean, old_log_std = old
-        divergence = torch.distributions.kl_divergence(
+        actions = self.query["actions"]
+        log_ratio = log_probability(mean, log_std, actions) - log_probability(*old, actions)
+        loss = -(log_ratio.exp() * self.query["advantages"]).mean()  # both (goals, B)
+        kl = torch.distributions.kl_divergence(
             Normal(old_mean, old_log_std.exp()), Normal(mean, log_std.exp())
         )
-        return loss.item(), divergence.sum(-1).mean().item()
+        return loss.item(), kl.sum(-1).mean().item()
 
 
 def trpo_step(
@@ -351,29 +393,25 @@ def trpo_step(
     gradient, _, _ = meta_gradient(
         policy.loss, params, list(zip(support, query)), lr=settings.inner_lr, vectorize=len(support)
     )
-    adapted = AdaptedPolicies(
-        policy,
-        support={name: torch.stack([batch[name] for batch in support]) for name in support[0]},
-        query={name: torch.stack([batch[name] for batch in query]) for name in query[0]},
-        inner_lr=settings.inner_lr,
-    )
-    product = adapted.fisher_product(params, settings.damping)
+    adapted = AdaptedPolicies(policy, stack(support), stack(query), settings.inner_lr)
+    product = adapted.fisher_vector_product(params, settings.damping)
 
     g = flatten(gradient).numpy()
     fisher_matrix = LinearOperator(
-        (g.size, g.size), matvec=lambda v: product(torch.from_numpy(v).float()).numpy()
+        shape=(g.size, g.size), matvec=lambda v: product(torch.from_numpy(v)).numpy(), dtype=g.dtype
     )
     direction, _ = cg(fisher_matrix, g, rtol=1e-10, maxiter=settings.cg_iterations)
     curvature = float(direction @ fisher_matrix.matvec(direction))
-    longest = math.sqrt(2 * settings.max_kl / max(curvature, 1e-12)) * torch.from_numpy(direction)
+    # The divergence of a step x is about x H x / 2: this one has max_kl.
+    full_step = math.sqrt(2 * settings.max_kl / max(curvature, 1e-12)) * torch.from_numpy(direction)
 
     with torch.no_grad():
         old = adapted.gaussians(params)
-        old_loss, _ = adapted.loss_and_divergence(params, old)
+        old_loss = -adapted.query["advantages"].mean().item()  # all ratios are 1
         for n in range(settings.backtracks):
-            change = unflatten(settings.backtrack_ratio**n * longest.float(), params)
+            change = unflatten(settings.backtrack_ratio**n * full_step, params)
             candidate = {name: p - change[name] for name, p in params.items()}
-            loss, kl = adapted.loss_and_divergence(candidate, old)
+            loss, kl = adapted.surrogate_loss_and_kl(candidate, old)
             if loss < old_loss and kl <= settings.max_kl:
                 policy.load_state_dict(candidate)
                 return {"kl": kl, "backtracks": n}
@@ -384,9 +422,9 @@ def trpo_step(
 
 
 def tasks_of_iteration(tasks: Sequence[str], iteration: int, settings: Settings) -> list[str]:
-    """The skills of an iteration, in an order of its own; each as often as any, or once more."""
-    rng = np.random.default_rng((settings.seed, iteration))
-    return np.resize(rng.permutation(tasks), settings.tasks).tolist()
+    """The task of each goal of an iteration; a task comes as often as any other, or once more."""
+    rng = np.random.default_rng((ORDER, settings.seed, iteration))
+    return np.resize(rng.permutation(tasks), settings.goals).tolist()
 
 
 def iterate(
@@ -398,45 +436,60 @@ def iterate(
     settings: Settings,
     bar: Any,
 ) -> dict[str, float]:
-    """One iteration: rollouts of all its tasks, then a step of TRPO. Returns its figures."""
+    """One iteration: rollouts to all its goals, then a step of TRPO. Returns its figures."""
     jobs = [
         {
             "simulator": simulator,
             "task": task,
             "goal_seed": episode_seed(
-                settings.seed, (iteration * settings.tasks + i) % EPISODE_SEEDS
+                settings.seed, (iteration * settings.goals + i) % EPISODE_SEEDS
             ),
-            "noise_seed": (settings.seed, iteration, i),
+            "noise_seed": (TRAINING, settings.seed, iteration, i),
             "policy": policy,
             "settings": settings,
         }
         for i, task in enumerate(tasks_of_iteration(tasks, iteration, settings))
     ]
-    results = pool.run(task_job, jobs, bar)
-    figures: dict[str, float] = {}
-    for when, rollouts in zip(("before", "after"), zip(*results)):
-        figures[f"return_{when}"] = float(np.mean([r.rewards.sum(1).mean() for r in rollouts]))
-        figures[f"success_{when}"] = float(np.mean([r.successes.any(1) for r in rollouts]))
-    support, query = ([to_batch(r, settings) for r in rollouts] for rollouts in zip(*results))
-    return {**figures, **trpo_step(policy, support, query, settings)}
+    support, query = zip(*pool.run(goal_job, jobs, bar))
+    figures = {
+        "return_before": float(np.mean([sample.mean_return for sample in support])),
+        "return_after": float(np.mean([sample.mean_return for sample in query])),
+        "success_before": float(np.mean([sample.success for sample in support])),
+        "success_after": float(np.mean([sample.success for sample in query])),
+    }
+    figures |= trpo_step(
+        policy,
+        support=[sample.batch for sample in support],
+        query=[sample.batch for sample in query],
+        settings=settings,
+    )
+    return figures
 
 
-def save(
-    path: Path, policy: GaussianPolicy, settings: Settings, suite: str, **progress: Any
-) -> None:
+@dataclass
+class Run:
+    """A training: what is kept of it, so that it can go on."""
+
+    policy: GaussianPolicy
+    iteration: int = 0  # iterations that are done
+    seconds: float = 0.0  # that they took
+
+
+def save(path: Path, run: Run, settings: Settings, suite: str) -> None:
     """Writes all that a run needs to go on."""
     content = {
         "suite": suite,
         "settings": asdict(settings),
-        "shape": policy_shape(policy),
-        "weights": policy.state_dict(),
-        **progress,
+        "shape": policy_shape(run.policy),
+        "weights": run.policy.state_dict(),
+        "iteration": run.iteration,
+        "seconds": run.seconds,
     }
     write_atomically(path, lambda temporary: torch.save(content, temporary))
 
 
-def restore(path: Path, settings: Settings, suite: str) -> tuple[GaussianPolicy, dict[str, Any]]:
-    """The policy of a run, and what else `save` wrote.
+def restore(path: Path, settings: Settings, suite: str) -> Run:
+    """The run that `save` wrote.
 
     Raises UserError if there is none, or one of another suite or other settings; `steps` and
     `episodes` may differ.
@@ -452,37 +505,40 @@ def restore(path: Path, settings: Settings, suite: str) -> tuple[GaussianPolicy,
     free = {"steps": settings.steps, "episodes": settings.episodes}
     if saved["suite"] != suite or {**saved["settings"], **free} != asdict(settings):
         raise UserError(f"{path} was trained with other settings: use those, or another --out")
-    return policy, saved
+    return Run(policy, saved["iteration"], saved["seconds"])
+
+
+def start(simulator: Simulator, suite: str, settings: Settings) -> Run:
+    """A run at its beginning."""
+    tasks, _ = simulator.tasks(suite)
+    env = environment(simulator, tasks[0])
+    env.begin(0)
+    torch.manual_seed(settings.seed)
+    state_dim, action_dim = len(env.state_without_goal()), env.action_space.shape[0]
+    return Run(GaussianPolicy(state_dim, action_dim, settings.hidden))
 
 
 def train(
+    run: Run,
     simulator: Simulator,
     suite: str,
-    policy: GaussianPolicy | None,
     settings: Settings,
     folder: Path,
-    saved: dict[str, Any],
     workers: int | None,
-) -> tuple[GaussianPolicy, float]:
-    """Trains until `settings.steps` steps are taken; returns the policy and the seconds.
+) -> int:
+    """Trains until at least `settings.steps` steps of the simulator are taken; returns how many.
 
-    `policy` and `saved` are those of `restore`, or None and an empty dictionary.
+    `run` is changed in place, and saved into `folder` after each iteration.
     """
     tasks, _ = simulator.tasks(suite)
-    steps_of_iteration = 2 * settings.tasks * settings.rollouts * simulator.episode_steps
+    steps_of_iteration = 2 * settings.goals * settings.rollouts * simulator.episode_steps
     iterations = math.ceil(settings.steps / steps_of_iteration)
-    if policy is None:
-        env = environment(simulator, tasks[0])
-        env.begin(0)
-        torch.manual_seed(settings.seed)
-        policy = GaussianPolicy(
-            state_dim=len(env.hidden_goal_state()),
-            action_dim=len(env.expert_action()),
-            hidden=settings.hidden,
+    if iterations < run.iteration:
+        raise UserError(
+            f"--steps is {settings.steps}: {run.iteration * steps_of_iteration} are taken already"
         )
-    first, seconds = saved.get("iteration", 0), saved.get("seconds", 0.0)
     log = folder / "metrics.jsonl"
-    kept = [line for line in read_json_lines(log) if line["iteration"] <= first]
+    kept = [line for line in read_json_lines(log) if line["iteration"] <= run.iteration]
     write_text(log, "".join(f"{json.dumps(line)}\n" for line in kept))
 
     bar = progress_bar(
@@ -490,25 +546,27 @@ def train(
         unit="step",
         unit_scale=True,
         total=iterations * steps_of_iteration,
-        initial=first * steps_of_iteration,
+        initial=run.iteration * steps_of_iteration,
     )
     with StopRequest() as stop, WorkerPool(workers) as pool, bar:
-        for iteration in range(first, iterations):
+        while run.iteration < iterations:
             began = time.monotonic()
-            figures = iterate(pool, simulator, tasks, policy, iteration, settings, bar)
-            seconds += time.monotonic() - began
-            done = iteration + 1
+            figures = iterate(pool, simulator, tasks, run.policy, run.iteration, settings, bar)
+            run.seconds += time.monotonic() - began
+            run.iteration += 1
             append_json(
                 log,
-                iteration=done,
-                steps=done * steps_of_iteration,
-                seconds=round(seconds, 1),
+                iteration=run.iteration,
+                steps=run.iteration * steps_of_iteration,
+                seconds=round(run.seconds, 1),
                 **figures,
             )
-            save(folder / "last.pt", policy, settings, suite, iteration=done, seconds=seconds)
+            save(folder / "last.pt", run, settings, suite)
             if stop.requested:
-                raise KeyboardInterrupt(f"saved after iteration {done}, add --resume to go on")
-    return policy, seconds
+                raise KeyboardInterrupt(
+                    f"saved after iteration {run.iteration}, add --resume to go on"
+                )
+    return run.iteration * steps_of_iteration
 
 
 # ---- Measuring -----------------------------------------------------------------------------------
@@ -524,12 +582,11 @@ def measure_job(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The successes (T,) of one rollout before the inner step, and of one after it.
 
-    Both take the means of the Gaussians. The inner step learns from rollouts to the same goal.
+    Both take the means of the Gaussians. The inner step learns from `rollouts` others with the same
+    start and goal.
     """
     env = environment(simulator, task)
-    _, action_dim, _ = policy_shape(policy)
-    shape = (settings.rollouts, simulator.episode_steps, action_dim)
-    noise = np.random.default_rng(noise_seed).standard_normal(shape, dtype=np.float32)
+    noise = draw_noise(policy, settings.rollouts, simulator.episode_steps, noise_seed)
     no_noise = np.zeros_like(noise[:1])
     before = roll_out(env, policy, goal_seed, no_noise)
     support = to_batch(roll_out(env, policy, goal_seed, noise), settings)
@@ -551,7 +608,7 @@ def measure(
             "simulator": simulator,
             "task": task,
             "goal_seed": evaluation_seed(settings.seed, i),
-            "noise_seed": (settings.seed, i),
+            "noise_seed": (MEASURING, settings.seed, i),
             "policy": policy,
             "settings": settings,
         }
@@ -563,11 +620,12 @@ def measure(
     )
     outcomes = {}
     for label, successes in zip(("before", "after one inner step"), zip(*results)):
-        outcome = Outcomes(any_step={}, at_end={})
-        for n, task in enumerate(tasks):
-            of_task = successes[n * settings.episodes : (n + 1) * settings.episodes]
-            outcome.any_step[task] = [bool(steps.any()) for steps in of_task]
-            outcome.at_end[task] = [bool(steps[-1]) for steps in of_task]
+        outcome = Outcomes(
+            any_step={task: [] for task in tasks}, at_end={task: [] for task in tasks}
+        )
+        for job, steps in zip(jobs, successes):
+            outcome.any_step[job["task"]].append(bool(steps.any()))
+            outcome.at_end[job["task"]].append(bool(steps[-1]))
         outcomes[label] = outcome
     return outcomes
 
@@ -577,7 +635,7 @@ def measure(
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Trains MAML-TRPO on a suite and measures it.")
-    parser.add_argument("--suite", default="ml10", help="ml10 or ml45 (ml10)")
+    parser.add_argument("--suite", default="ml10", help="of Meta-World, such as ml10, ml45 (ml10)")
     parser.add_argument("--out", help="folder of the run (runs/rl-SUITE-seedN)")
     parser.add_argument("--resume", action="store_true", help="go on with the run in --out")
     parser.add_argument("--workers", type=int, help="processes that roll out (one a core)")
@@ -591,27 +649,27 @@ def main(argv: Sequence[str] | None = None) -> None:
     simulator = simulator_of(args.suite)
     folder = Path(args.out or f"runs/rl-{args.suite}-seed{settings.seed}")
     checkpoint = folder / "last.pt"
-    torch.set_num_threads(1)  # the other cores have workers
 
     with locked(folder):
-        policy, saved = None, {}
         if args.resume:
-            policy, saved = restore(checkpoint, settings, args.suite)
+            run = restore(checkpoint, settings, args.suite)
         elif checkpoint.exists():
             raise UserError(f"{folder} already holds a run: add --resume, or another --out")
+        else:
+            run = start(simulator, args.suite, settings)
         print_settings(asdict(settings), asdict(Settings()))
-        policy, seconds = train(
-            simulator, args.suite, policy, settings, folder, saved, args.workers
-        )
+        steps = train(run, simulator, args.suite, settings, folder, args.workers)
         base_tasks, novel_tasks = simulator.tasks(args.suite)
-        outcomes = measure(simulator, [*base_tasks, *novel_tasks], policy, settings, args.workers)
+        outcomes = measure(
+            simulator, [*base_tasks, *novel_tasks], run.policy, settings, args.workers
+        )
         table = write_report(
             folder,
             outcomes,
             {
                 "title": f"MAML-TRPO, {args.suite}",
-                "steps": settings.steps,
-                "training seconds": round(seconds),
+                "steps": steps,
+                "training seconds": round(run.seconds),
                 "goals a task": settings.episodes,
                 "seed": settings.seed,
                 **provenance("rl.py", argv, "cpu"),

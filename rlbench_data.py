@@ -3,13 +3,15 @@
 convert.py imports data sets of RLBench with this file, and rlbench_env.py evaluates with it, so
 that both see the same clouds and mean the same by an action. RLBench itself is not needed here.
 
-A state (7,) is the gripper's position x, y, z in metres, its orientation as a rotation vector, of
-its two forms the nearer to `ROTATION_NEAR`, and 1 where the gripper is open, 0 where it is closed.
+A state (7,) is the gripper's position x, y, z in metres, its orientation as a rotation vector (of
+its two equivalent forms the one nearer to `ROTATION_NEAR`), and 1 for an open gripper, 0 for a
+closed one.
 
 An action (7,) leads from one frame to the next. It is the displacement of the gripper in metres, a
 rotation vector in radians, which is applied after the present orientation, and 1 or 0 for a gripper
 that is open or closed then. All of this is in the world frame. `action_between` makes an action of
-two states, and `target_of` makes of it the pose that RLBench's `EndEffectorPoseViaIK` takes.
+two states, and `target_of` makes of state and action what RLBench's own actions are: the pose that
+`EndEffectorPoseViaIK` takes, and the gripper.
 
 A data set is read from the folders that RLBench writes:
 
@@ -43,7 +45,7 @@ CAMERAS = ("front", "left_shoulder", "right_shoulder")
 WRIST = "wrist"  # one camera more, where it is asked for
 WORKSPACE = ((-0.3, -0.5, 0.6), (0.7, 0.5, 1.6))  # the table top and what stands on it
 ROTATION_NEAR = (0.0, 3.14159, 0.0)  # the gripper points down
-SAMPLED_FROM = 8192  # points at most, since sampling takes time; of more, every k-th
+SAMPLED_FROM = 8192  # points at most; of more, every k-th is kept, since sampling takes time
 
 # How recordings are made. The suite `fs25` refuses those that were made in another way.
 RECIPE = {
@@ -78,7 +80,7 @@ def state_of(gripper_pose: np.ndarray, gripper_open: float) -> np.ndarray:
 
 
 def action_between(state: np.ndarray, next_state: np.ndarray) -> np.ndarray:
-    """The action (7,) that leads from one state to the next one; `target_of` is its inverse."""
+    """The action (7,) that leads from one state to the next one."""
     return np.append(difference(state[:6], next_state[:6]), next_state[6])
 
 
@@ -158,8 +160,8 @@ def seen_points(
 class Kept:
     """What stands for a class or function in a pickle: it keeps what it is given, and does nothing.
 
-    NumPy's own functions are no safe ones for files of others: they take sizes and types as the
-    file says them. So not even those are called; `read_numbers` checks what was kept.
+    NumPy's functions trust the sizes and types that a file states, so that not even those are
+    called. `read_numbers` checks what was kept.
     """
 
     __slots__ = ("arguments", "state")
@@ -269,7 +271,7 @@ def read_numbers(
 
 
 def kept_array(kept: Kept) -> np.ndarray:
-    """The array of what a pickle kept of one. Raises many types of errors if that is none.
+    """The array that a `Kept` stands for. Raises errors of many types if it is none.
 
     The type is one of NUMBER_TYPES, and NumPy checks the shape against the number of bytes.
     """
@@ -277,9 +279,9 @@ def kept_array(kept: Kept) -> np.ndarray:
         _, shape, dtype, fortran, data = kept.state
         return plain_array(data, dtype).reshape(shape, order="F" if fortran else "C")
     if isinstance(kept, BufferArray):
-        data, dtype, shape, order, *axes = kept.arguments
+        data, dtype, shape, order = kept.arguments[:4]
         if order == "K":
-            return plain_array(data, dtype).reshape(shape).transpose(*axes)
+            return plain_array(data, dtype).reshape(shape).transpose(kept.arguments[4])
         return plain_array(data, dtype).reshape(shape, order=order)
     if isinstance(kept, Scalar):
         dtype, data = kept.arguments

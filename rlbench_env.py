@@ -31,8 +31,9 @@ import numpy as np
 from common import UserError
 from data import farthest_point_sample
 from rlbench_data import CAMERAS, RECIPE, read_view, seen_points, state_of, target_of
+from simulator import OutOfSightError
 
-EPISODE_STEPS = 400  # our choice: a step is one of 20 frames a second of the demonstrations
+EPISODE_STEPS = 400  # our choice: an action for each of 20 frames a second of a demonstration
 IMAGE_PIXELS = 128  # height and width of all images, as rlbench-generate-dataset has them
 RENDER_PIXELS = 240
 
@@ -175,7 +176,10 @@ class RLBenchEnv:
             )
             for camera in CAMERAS
         ]
-        cloud = farthest_point_sample(seen_points(views), self.num_points)
+        points = seen_points(views)
+        if len(points) == 0:
+            raise OutOfSightError(f"{self.task}: nothing was seen inside the workspace")
+        cloud = farthest_point_sample(points, self.num_points)
         return {"point_cloud": cloud, "agent_pos": self.state().astype(np.float32)}
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
@@ -183,7 +187,7 @@ class RLBenchEnv:
         from rlbench.backend.exceptions import InvalidActionError
 
         if running["episode"] is not self:
-            raise RuntimeError("an episode ends where another one begins in the same process")
+            raise RuntimeError("another episode has begun in this process, which has one simulator")
         target = target_of(self.state(), action)
         self.steps += 1
         try:

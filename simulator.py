@@ -3,10 +3,11 @@
     python simulator.py --suite ml10        # ten demonstrations of each of its 15 tasks into data/
     python simulator.py --task shelf-place  # of one task
 
-What trains, adapts and evaluates knows a simulator only by the two Protocols below, `Simulator` and
-`Environment`. A new simulator is a file with a class that has their methods, and an entry in
-SIMULATORS for each of its suites of tasks. Its packages are imported only when one of its suites is
-asked for: own recordings are trained on without them.
+What trains, adapts and evaluates a policy knows a simulator only by the two Protocols below,
+`Simulator` and `Environment`; rl.py needs states besides, see there. A new simulator is a file with
+a class that has their methods, and an entry in SIMULATORS for each of its suites of tasks. Its
+packages are imported only when one of its suites is asked for: own recordings are trained on
+without them.
 
 Letters: N points of an observation, S state dim, A action dim, T frames of an episode.
 """
@@ -28,6 +29,10 @@ from data import Demonstrations, RecordingError, load_demonstrations, save_demon
 # ---- What a simulator is -------------------------------------------------------------------------
 
 
+class OutOfSightError(Exception):
+    """There is nothing to observe: everything is out of the camera's sight."""
+
+
 class Environment(Protocol):
     """One task of a simulator. An episode is `begin`, then `observe` and `advance` in turns.
 
@@ -43,7 +48,8 @@ class Environment(Protocol):
 
         "point_cloud" (N, 3) float32, or (N, point_dim) where points have features such as colours;
         in the order of farthest point sampling, so that its first k points are a good sample, too.
-        "agent_pos" (S,) float32. World frame, metres.
+        "agent_pos" (S,) float32. World frame, metres. Raises OutOfSightError where nothing is seen;
+        a rollout is over then, and its end is no success.
         """
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:

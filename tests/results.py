@@ -472,6 +472,7 @@ HIDDEN_ROWS = (
     ("its frames in another order", "demonstration", Column("parts", 3)),
     ("no demonstration, second order, before any step", "inner", Column("0-steps")),
     ("the same, one inner step", "inner", Column("1-steps")),
+    ("the same, one inner step on another goal", "inner", Column("1-steps-swap", 1)),
     ("the same, five inner steps", "inner", Column("5-steps")),
     ("the same, twenty inner steps", "inner", Column("20-steps")),
     ("no demonstration, first order, before any step", "inner-first-order", Column("0-steps")),

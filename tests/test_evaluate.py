@@ -334,6 +334,34 @@ def test_of_pairs_it_is_told_how_often_the_other_task_was_done(run, recordings, 
     assert "the other task" in evaluate.Path("pairs/success.md").read_text()
 
 
+def test_a_rollout_ends_without_success_where_nothing_is_seen(run, recordings):
+    class Hidden(ToySimulator):
+        def make(self, task, num_points):
+            environment = super().make(task, num_points)
+            observe, advance = environment.observe, environment.advance
+
+            def observe_twice():
+                if environment.steps > 4:
+                    raise simulator.OutOfSightError("gone")
+                return observe()
+
+            def always_successful(action):
+                reward, truncated, _ = advance(action)
+                return reward, truncated, {"success": True}
+
+            environment.observe, environment.advance = observe_twice, always_successful
+            return environment
+
+    outcomes = evaluate.evaluate_checkpoint(
+        run / "ema-00006.pt",
+        Hidden(),
+        {"touch-red": recordings["touch-red"]},
+        {"touch-red": torch.zeros(512)},
+        episodes=2,
+    )
+    assert outcomes == report.Outcomes({"touch-red": [True] * 2}, {"touch-red": [False] * 2})
+
+
 def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordings, monkeypatch):
     frames = []
 

@@ -16,7 +16,7 @@ import metaworld_env
 from common import UserError
 from data import Demonstrations, load_demonstrations, save_demonstrations
 from metaworld_env import MetaWorld, MetaWorldPointCloudEnv
-from simulator import SIMULATORS, collect, demonstration_seed
+from simulator import SIMULATORS, OutOfSightError, collect, demonstration_seed
 
 ROOT = Path(metaworld_env.__file__).resolve().parent
 
@@ -82,7 +82,7 @@ def test_an_empty_cloud_is_refused_and_one_of_the_arm_alone_is_not(reach, monkey
     monkeypatch.setattr(reach.camera, "points", lambda *_, **__: (points[of_arm], ids[of_arm]))
     assert len(np.unique(reach.observe()["point_cloud"], axis=0)) > 100
     monkeypatch.setattr(reach.camera, "points", lambda *_, **__: (points[:0], ids[:0]))
-    with pytest.raises(ValueError, match="the cloud is empty"):
+    with pytest.raises(OutOfSightError, match="reach: nothing was seen"):
         reach.observe()
 
 

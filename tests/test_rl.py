@@ -1,14 +1,17 @@
 """Tests of rl.py: its gradients against finite differences, and that it learns."""
 
+import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 
+import common
 import rl
-from common import UserError, command_line
 from rl import AdaptedPolicies, GaussianPolicy, Rollouts, Settings
 from simulator import SIMULATORS
 
@@ -16,16 +19,15 @@ from simulator import SIMULATORS
 class PointEnvironment:
     """A point in the plane that moves to a goal which its state does not show."""
 
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
     def begin(self, seed):
         self.steps, self.position = 0, np.zeros(2)
         angle = np.random.default_rng(seed).uniform(0, 2 * np.pi)
         self.goal = np.array([np.cos(angle), np.sin(angle)])
 
-    def hidden_goal_state(self):
+    def state_without_goal(self):
         return self.position.astype(np.float32)
-
-    def expert_action(self):
-        return np.float32(self.goal - self.position)
 
     def advance(self, action):
         self.position = self.position + 0.2 * np.clip(action, -1, 1)
@@ -49,14 +51,23 @@ class PointSimulator:
         return PointEnvironment()
 
 
-class Here:
-    """In place of `common.WorkerPool`: in this process."""
+class InProcessPool:
+    """In place of `common.WorkerPool`: it calls jobs in this process."""
+
+    def __init__(self, workers=None):
+        pass
 
     def run(self, job, jobs, bar=None):
         return [job(**arguments) for arguments in jobs]
 
+    def __enter__(self):
+        return self
 
-POINT = Settings(tasks=6, rollouts=6, hidden=32)
+    def __exit__(self, *_):
+        pass
+
+
+POINT = Settings(goals=6, rollouts=6, hidden=32)
 
 
 def random_batches(n, policy, seed=0):
@@ -83,12 +94,9 @@ def adapted():
     torch.manual_seed(0)
     policy = GaussianPolicy(3, 2, hidden=5).double()
     support, query = random_batches(3, policy)
-    stacked = [
-        {name: torch.stack([b[name] for b in batches]) for name in batches[0]}
-        for batches in (support, query)
-    ]
     params = {name: p.detach() for name, p in policy.named_parameters()}
-    return AdaptedPolicies(policy, *stacked, inner_lr=0.3), params, support, query
+    policies = AdaptedPolicies(policy, rl.stack(support), rl.stack(query), inner_lr=0.3)
+    return policies, params, support, query
 
 
 # ---- Gradients -----------------------------------------------------------------------------------
@@ -106,7 +114,7 @@ def test_the_outer_gradient_is_that_of_trpos_loss_through_the_inner_step(adapted
         for sign in (1, -1):
             moved = theta.clone()
             moved[i] += sign * step
-            loss, _ = policies.loss_and_divergence(rl.unflatten(moved, params), old)
+            loss, _ = policies.surrogate_loss_and_kl(rl.unflatten(moved, params), old)
             sides.append(loss)
         difference = (sides[0] - sides[1]) / (2 * step)
         assert rl.flatten(gradient)[i].item() == pytest.approx(difference, rel=1e-5, abs=1e-8)
@@ -125,7 +133,7 @@ def test_the_fisher_product_is_the_second_derivative_of_the_divergence(adapted):
         return kl.sum(-1).mean()
 
     hessian = torch.autograd.functional.hessian(divergence, theta)
-    product = policies.fisher_product(params, damping=0.01)
+    product = policies.fisher_vector_product(params, damping=0.01)
     v = torch.randn(len(theta), generator=torch.Generator().manual_seed(1), dtype=theta.dtype)
     torch.testing.assert_close(product(v), hessian @ v + 0.01 * v)
 
@@ -134,10 +142,10 @@ def test_a_step_improves_the_loss_and_keeps_to_the_divergence(adapted):
     policies, params, support, query = adapted
     settings = replace(POINT, inner_lr=policies.inner_lr, max_kl=0.02)
     old = policies.gaussians(params)
-    old_loss, _ = policies.loss_and_divergence(params, old)
+    old_loss, _ = policies.surrogate_loss_and_kl(params, old)
     figures = rl.trpo_step(policies.policy, support, query, settings)
     new = {name: p.detach() for name, p in policies.policy.named_parameters()}
-    loss, kl = policies.loss_and_divergence(new, old)
+    loss, kl = policies.surrogate_loss_and_kl(new, old)
     assert loss < old_loss - 0.01 and 0.005 < kl <= 0.02
     assert figures["kl"] == pytest.approx(kl)
 
@@ -168,11 +176,12 @@ def test_what_the_state_and_the_time_foretell_is_no_advantage():
 
 def returns(policy, goals=20, seed=1):
     """The mean returns to new goals before and after an inner step."""
-    results = [
-        rl.task_job(PointSimulator(), "move", rl.evaluation_seed(seed, i), (seed, i), policy, POINT)
+    simulator = PointSimulator()
+    samples = [
+        rl.goal_job(simulator, "move", rl.evaluation_seed(seed, i), (seed, i), policy, POINT)
         for i in range(goals)
     ]
-    return [np.mean([r.rewards.sum(1).mean() for r in rollouts]) for rollouts in zip(*results)]
+    return [np.mean([sample.mean_return for sample in when]) for when in zip(*samples)]
 
 
 def test_it_learns_to_find_a_goal_that_only_rewards_tell():
@@ -180,9 +189,9 @@ def test_it_learns_to_find_a_goal_that_only_rewards_tell():
     policy = GaussianPolicy(2, 2, POINT.hidden)
     untrained_before, untrained_after = returns(policy)
     for iteration in range(30):
-        rl.iterate(Here(), PointSimulator(), ["move"], policy, iteration, POINT, bar=None)
+        rl.iterate(InProcessPool(), PointSimulator(), ["move"], policy, iteration, POINT, bar=None)
     before, after = returns(policy)
-    assert after > before + 3  # of 20 steps, each as far from the goal as its reward says
+    assert after > before + 3  # of 10 steps, whose rewards are the distances, negative
     assert after > untrained_after + 3
     assert untrained_after < untrained_before + 2
 
@@ -194,29 +203,25 @@ def test_it_learns_to_find_a_goal_that_only_rewards_tell():
 def point_suite(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(SIMULATORS, "point", PointSimulator)
-    monkeypatch.setattr(rl, "run_jobs", lambda job, jobs, **_: Here().run(job, jobs))
-    monkeypatch.setattr(rl, "WorkerPool", lambda workers: Pool())
-
-    class Pool(Here):
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            pass
-
-    return "--suite point --tasks 2 --rollouts 2 --hidden 8 --episodes 2 --steps".split()
+    monkeypatch.setattr(rl, "run_jobs", lambda job, jobs, **_: InProcessPool().run(job, jobs))
+    monkeypatch.setattr(rl, "WorkerPool", InProcessPool)
+    return "--suite point --goals 2 --rollouts 2 --hidden 8 --episodes 2 --steps".split()
 
 
-def test_a_run_that_was_resumed_ends_with_the_same_weights(point_suite):
-    rl.main([*point_suite, "240", "--out", "whole"])  # three iterations of 80 steps
+def test_a_run_that_was_resumed_ends_with_the_same_weights(point_suite, monkeypatch):
+    """Also where one of the two rolls out in other processes."""
     rl.main([*point_suite, "160", "--out", "parts"])
     rl.main([*point_suite, "240", "--out", "parts", "--resume"])
+    monkeypatch.setattr(rl, "WorkerPool", common.WorkerPool)
+    rl.main([*point_suite, "240", "--out", "whole"])  # three iterations of 80 steps
     whole, parts = (torch.load(f"{name}/last.pt", weights_only=True) for name in ("whole", "parts"))
     assert whole["iteration"] == parts["iteration"] == 3
     for name, weight in whole["weights"].items():
         assert torch.equal(weight, parts["weights"][name])
-    assert rl.read_json_lines(rl.Path("parts/metrics.jsonl"))[-1]["steps"] == 240
-    assert rl.Path("parts/success.json").exists()
+    assert rl.read_json_lines(Path("parts/metrics.jsonl"))[-1]["steps"] == 240
+    report = json.loads(Path("parts/success.json").read_text())
+    assert report["provenance"]["steps"] == 240
+    assert set(report["successes"]) == {"before", "after one inner step"}
 
 
 @pytest.mark.parametrize(
@@ -227,15 +232,16 @@ def test_a_run_that_was_resumed_ends_with_the_same_weights(point_suite):
         (["--resume", "--out", "run", "--hidden", "9"], "trained with other settings"),
         (["--resume", "--out", "damaged"], "is damaged"),
         (["--suite", "poin"], "did you mean 'point'"),
+        (["--resume", "--out", "run", "--steps", "80"], "160 are taken already"),
         (["--max-kl", "-1"], "--max-kl is -1.0: use at least 0"),
     ],
 )
 def test_mistakes_are_one_line(point_suite, capsys, arguments, message):
     rl.main([*point_suite, "160", "--out", "run"])
-    rl.Path("damaged").mkdir()
-    rl.Path("damaged/last.pt").write_bytes(b"no checkpoint")
+    Path("damaged").mkdir()
+    Path("damaged/last.pt").write_bytes(b"no checkpoint")
     with pytest.raises(SystemExit, match="2"):
-        command_line(lambda: rl.main([*point_suite, "160", *arguments]))
+        common.command_line(lambda: rl.main([*point_suite, "160", *arguments]))
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
@@ -244,16 +250,16 @@ def test_meta_worlds_state_hides_the_goal_alone():
 
     env = MetaWorldPointCloudEnv("push")
     env.begin(0)
-    state = env.hidden_goal_state()
+    state = env.state_without_goal()
     assert state.shape == (39,) and state.dtype == np.float32
     np.testing.assert_array_equal(state[:36], np.float32(env.expert_observation[:36]))
     assert not state[36:].any() and env.expert_observation[36:].any()
 
 
 def test_a_simulator_without_such_states_is_refused():
-    class Blind(PointSimulator):
+    class SimulatorWithoutStates(PointSimulator):
         def make(self, task, num_points):
             return object()
 
-    with pytest.raises(UserError, match="use --suite ml10"):
-        rl.environment(Blind(), "move")
+    with pytest.raises(common.UserError, match="use --suite ml10"):
+        rl.environment(SimulatorWithoutStates(), "move")

@@ -251,7 +251,7 @@ def test_inner_steps_before_a_rollout_change_the_policy_by_its_own_rate(here, ow
         policy, sampler, text, steps=2, batch=4, lr=evaluate.inner_rate(learned, "cpu")
     )
     assert all(torch.equal(a, b) for a, b in zip(still.parameters(), policy.parameters()))
-    assert evaluate.inner_rate(learned, "cpu", given=0.2) == 0.2
+    assert evaluate.inner_rate(learned, "cpu", override=0.2) == 0.2
 
 
 def test_evaluation_adapts_at_the_rate_that_is_given(here, own_folder, monkeypatch):
