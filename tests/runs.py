@@ -130,7 +130,7 @@ MULTI_TASK = ("neither", "neither-as-long")
 # was best on the goals of validation, of 0.01, 0.03, 0.1, 0.3 and 1:
 # python evaluate.py --suite goals-reach-validation --split novel --checkpoint
 # runs/goals-reach-neither-seed0 --episodes 3 --seed 2 --inner-steps 1 --inner-lr 0.03
-MULTI_TASK_RATES = {1: 0.03, 5: 0.01, 20: 0.01}
+MULTI_TASK_RATES = {1: 0.03, 5: 0.01, 20: 0.3}
 
 
 def hidden_reports() -> dict[str, tuple[str, Sequence[str]]]:
