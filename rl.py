@@ -413,7 +413,7 @@ def trpo_step(
             candidate = {name: p - change[name] for name, p in params.items()}
             loss, kl = adapted.surrogate_loss_and_kl(candidate, old)
             if loss < old_loss and kl <= settings.max_kl:
-                policy.load_state_dict(candidate)
+                policy.load_state_dict(candidate)  # no worker reads it any more: jobs have ended
                 return {"kl": kl, "backtracks": n}
     return {"kl": 0.0, "backtracks": settings.backtracks}
 
