@@ -522,6 +522,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "ml45 novel": lambda results: by_task_table(results, "novel", "ml45"),
     "looks": looks_table,
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
+    "goals push": lambda results: hidden_goals_table(results, "push"),
     "swap": swap_table,
     "reading": reading_table,
 }
