@@ -119,7 +119,7 @@ INNER = (
 HIDDEN_METHOD = {
     "demonstration": "--maml off",
     "neither": f"{NO_DEMONSTRATION} --maml off",
-    "neither-as-long": f"{NO_DEMONSTRATION} --maml off --steps 6000",
+    "neither-as-long": f"{NO_DEMONSTRATION} --maml off --steps 6500",
     "inner": INNER,
     "inner-first-order": f"{INNER} --maml first",
     "both": "",
