@@ -200,15 +200,16 @@ def test_inner_steps_are_as_those_of_the_training_and_keep_its_normalizer(run, r
     assert [line["step"] for line in metrics(Path("inner"))] == [1, 2]
     finetune.main([*argv, "--inner-lr", "1e-3", "--batch", "4", "--out", "same"])
     finetune.main([*argv, "--inner-lr", "0", "--out", "unmoved"])
-    old, new, same, unmoved = (
+    finetune.main([*argv, "--inner-lr", "1", "--out", "far"])  # no step is lost in rounding
+    old, new, same, unmoved, far = (
         dict(weights(path)[0])
         for path in (
             run / "ema-00006.pt",
-            *(f"{n}/adapted.pt" for n in ("inner", "same", "unmoved")),
+            *(f"{n}/adapted.pt" for n in ("inner", "same", "unmoved", "far")),
         )
     )
-    assert same_bits(new, same) and same_bits(old, unmoved)
-    unchanged = {name for name in old if torch.equal(old[name], new[name])}
+    assert same_bits(new, same) and same_bits(old, unmoved) and not same_bits(old, new)
+    unchanged = {name for name in old if torch.equal(old[name], far[name])}
     assert unchanged == {name for name in old if name.startswith("normalizer")}
 
 

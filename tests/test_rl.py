@@ -67,7 +67,7 @@ class InProcessPool:
         pass
 
 
-POINT = Settings(goals=6, rollouts=6, hidden=32)
+POINT = Settings(goals=5, rollouts=5, hidden=32, cg_iterations=5)
 
 
 def random_batches(n, policy, seed=0):
@@ -174,7 +174,7 @@ def test_what_the_state_and_the_time_foretell_is_no_advantage():
 # ---- It learns -----------------------------------------------------------------------------------
 
 
-def returns(policy, goals=20, seed=1):
+def returns(policy, goals=10, seed=1):
     """The mean returns to new goals before and after an inner step."""
     simulator = PointSimulator()
     samples = [
@@ -209,10 +209,10 @@ def point_suite(monkeypatch, tmp_path):
 
 
 def test_a_run_that_was_resumed_ends_with_the_same_weights(point_suite, monkeypatch):
-    """Also where one of the two rolls out in other processes."""
+    """Also where one of the two rolls out in another process."""
     rl.main([*point_suite, "160", "--out", "parts"])
     rl.main([*point_suite, "240", "--out", "parts", "--resume"])
-    monkeypatch.setattr(rl, "WorkerPool", common.WorkerPool)
+    monkeypatch.setattr(rl, "WorkerPool", lambda workers: common.WorkerPool(1))
     rl.main([*point_suite, "240", "--out", "whole"])  # three iterations of 80 steps
     whole, parts = (torch.load(f"{name}/last.pt", weights_only=True) for name in ("whole", "parts"))
     assert whole["iteration"] == parts["iteration"] == 3

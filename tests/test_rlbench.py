@@ -520,7 +520,7 @@ def test_rlbench_is_launched_once_and_asked_for_what_is_used():
     assert config.front_camera.rgb and not config.left_shoulder_camera.rgb
     assert config.front_camera.image_size == (128, 128)
     assert other.task_environment.variation == 0
-    with pytest.raises(RuntimeError, match="another one begins"):
+    with pytest.raises(RuntimeError, match="another episode has begun"):
         env.advance(np.zeros(7))
 
 
