@@ -138,12 +138,12 @@ def log_probability(mean: Tensor, log_std: Tensor, actions: Tensor) -> Tensor:
 
 @dataclass
 class Rollouts:
-    """R rollouts to one goal: arrays (R, T, ...)."""
+    """R rollouts to one goal."""
 
-    states: np.ndarray
-    actions: np.ndarray
-    rewards: np.ndarray
-    successes: np.ndarray  # bool
+    states: np.ndarray  # (R, T, S)
+    actions: np.ndarray  # (R, T, A)
+    rewards: np.ndarray  # (R, T)
+    successes: np.ndarray  # (R, T) bool
 
 
 @cache
@@ -155,24 +155,33 @@ def environment(simulator: Simulator, task: str) -> Any:
     return env
 
 
-def draw_noise(policy: GaussianPolicy, rollouts: int, steps: int, seed: tuple[int, ...]) -> Any:
+@dataclass(frozen=True)
+class Goal:
+    """One goal of a task, and what is random on the way to it."""
+
+    task: str
+    seed: int  # of the episode: its start and its goal
+    noise_seed: tuple[int, ...]  # of the actions
+
+
+def draw_noise(goal: Goal, rollouts: int, steps: int, action_dim: int) -> np.ndarray:
     """The standard normal numbers (R, T, A) float32 that actions are drawn with."""
-    shape = (rollouts, steps, len(policy.log_std))
-    return np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
+    rng = np.random.default_rng(goal.noise_seed)
+    return rng.standard_normal((rollouts, steps, action_dim), dtype=np.float32)
 
 
-def roll_out(env: Any, policy: GaussianPolicy, goal_seed: int, noise: np.ndarray) -> Rollouts:
+def roll_out(env: Any, policy: GaussianPolicy, goal: Goal, noise: np.ndarray) -> Rollouts:
     """Rolls a policy out, always from the same start to the same goal.
 
     Args:
         env: an environment that has `state_without_goal`.
-        goal_seed: of the episode: start and goal.
+        goal: where to.
         noise: (R, T, A), see `draw_noise`; zeros give the means.
     """
     std = policy.log_std.exp().detach().numpy()
     states, actions, rewards, successes = [], [], [], []  # of all steps, one after the other
     for noise_of_rollout in noise:
-        env.begin(goal_seed)
+        env.begin(goal.seed)
         for noise_of_step in noise_of_rollout:
             state = env.state_without_goal()
             with torch.inference_mode():
@@ -270,6 +279,7 @@ class Sample:
 
 
 def to_sample(rollouts: Rollouts, settings: Settings) -> Sample:
+    """What `trpo_step` and the log need of rollouts."""
     return Sample(
         batch=to_batch(rollouts, settings),
         mean_return=float(rollouts.rewards.sum(axis=1).mean()),
@@ -278,23 +288,18 @@ def to_sample(rollouts: Rollouts, settings: Settings) -> Sample:
 
 
 def goal_job(
-    simulator: Simulator,
-    task: str,
-    goal_seed: int,
-    noise_seed: tuple[int, ...],
-    policy: GaussianPolicy,
-    settings: Settings,
+    goal: Goal, simulator: Simulator, policy: GaussianPolicy, settings: Settings
 ) -> tuple[Sample, Sample]:
     """Rollouts to one goal before and after the inner step: support and query."""
-    env = environment(simulator, task)
-    noise = draw_noise(policy, 2 * settings.rollouts, simulator.episode_steps, noise_seed)
-    rollouts = roll_out(env, policy, goal_seed, noise[: settings.rollouts])
-    report_progress(task, rollouts.rewards.size)
-    support = to_sample(rollouts, settings)
+    R, T, A = settings.rollouts, simulator.episode_steps, len(policy.log_std)
+    env = environment(simulator, goal.task)
+    noise = draw_noise(goal, 2 * R, T, A)
+    support = to_sample(roll_out(env, policy, goal, noise[:R]), settings)
+    report_progress(goal.task, R * T)
     adapted = adapted_policy(policy, support.batch, settings)
-    rollouts = roll_out(env, adapted, goal_seed, noise[settings.rollouts :])
-    report_progress(task, rollouts.rewards.size)
-    return support, to_sample(rollouts, settings)
+    query = to_sample(roll_out(env, adapted, goal, noise[R:]), settings)
+    report_progress(goal.task, R * T)
+    return support, query
 
 
 def stack(batches: Sequence[Batch]) -> Batch:
@@ -372,8 +377,10 @@ class AdaptedPolicies:
         mean, log_std = self.gaussians(params)
         old_mean, old_log_std = old
         actions = self.query["actions"]
-        log_ratio = log_probability(mean, log_std, actions) - log_probability(*old, actions)
-        loss = -(log_ratio.exp() * self.query["advantages"]).mean()  # both (goals, B)
+        log_p = log_probability(mean, log_std, actions)  # (goals, B)
+        old_log_p = log_probability(old_mean, old_log_std, actions)
+        ratio = torch.exp(log_p - old_log_p)
+        loss = -(ratio * self.query["advantages"]).mean()
         kl = torch.distributions.kl_divergence(
             Normal(old_mean, old_log_std.exp()), Normal(mean, log_std.exp())
         )
@@ -382,12 +389,19 @@ class AdaptedPolicies:
 
 def trpo_step(
     policy: GaussianPolicy, support: list[Batch], query: list[Batch], settings: Settings
-) -> dict[str, float]:
+) -> tuple[float, int]:
     """Changes the policy's parameters so that it is better after the inner step.
 
-    The natural gradient H^-1 g gives the direction; the step goes as far as `max_kl` allows, and is
+    The natural gradient H^-1 g gives the direction. The step goes as far as `max_kl` allows, and is
     shortened until the loss falls and the divergence is at most that. If it never does, nothing is
-    changed. Returns how far it went: "kl", and "backtracks".
+    changed.
+
+    Args:
+        policy: it is changed in place.
+        support, query: the batches of the goals, of the same goal at the same place.
+
+    Returns:
+        The divergence of the step (0 if nothing was changed), and how often it was shortened.
     """
     params = {name: p.detach() for name, p in policy.named_parameters()}
     gradient, _, _ = meta_gradient(
@@ -414,8 +428,8 @@ def trpo_step(
             loss, kl = adapted.surrogate_loss_and_kl(candidate, old)
             if loss < old_loss and kl <= settings.max_kl:
                 policy.load_state_dict(candidate)  # no worker reads it any more: jobs have ended
-                return {"kl": kl, "backtracks": n}
-    return {"kl": 0.0, "backtracks": settings.backtracks}
+                return kl, n
+    return 0.0, settings.backtracks
 
 
 # ---- Training ------------------------------------------------------------------------------------
@@ -437,33 +451,33 @@ def iterate(
     bar: Any,
 ) -> dict[str, float]:
     """One iteration: rollouts to all its goals, then a step of TRPO. Returns its figures."""
-    jobs = [
-        {
-            "simulator": simulator,
-            "task": task,
-            "goal_seed": episode_seed(
-                settings.seed, (iteration * settings.goals + i) % EPISODE_SEEDS
-            ),
-            "noise_seed": (TRAINING, settings.seed, iteration, i),
-            "policy": policy,
-            "settings": settings,
-        }
-        for i, task in enumerate(tasks_of_iteration(tasks, iteration, settings))
-    ]
+    jobs = []
+    for i, task in enumerate(tasks_of_iteration(tasks, iteration, settings)):
+        number = (iteration * settings.goals + i) % EPISODE_SEEDS
+        goal = Goal(
+            task,
+            seed=episode_seed(settings.seed, number),
+            noise_seed=(TRAINING, settings.seed, iteration, i),
+        )
+        jobs.append({"goal": goal, "simulator": simulator, "policy": policy, "settings": settings})
     support, query = zip(*pool.run(goal_job, jobs, bar))
-    figures = {
-        "return_before": float(np.mean([sample.mean_return for sample in support])),
-        "return_after": float(np.mean([sample.mean_return for sample in query])),
-        "success_before": float(np.mean([sample.success for sample in support])),
-        "success_after": float(np.mean([sample.success for sample in query])),
-    }
-    figures |= trpo_step(
+    kl, backtracks = trpo_step(
         policy,
         support=[sample.batch for sample in support],
         query=[sample.batch for sample in query],
         settings=settings,
     )
-    return figures
+    return {
+        "return_before": float(np.mean([sample.mean_return for sample in support])),
+        "return_after": float(np.mean([sample.mean_return for sample in query])),
+        "success_before": float(np.mean([sample.success for sample in support])),
+        "success_after": float(np.mean([sample.success for sample in query])),
+        "kl": kl,
+        "backtracks": backtracks,
+    }
+
+
+FREE_TO_CHANGE = ("steps", "episodes")  # when a run is resumed
 
 
 @dataclass
@@ -491,8 +505,8 @@ def save(path: Path, run: Run, settings: Settings, suite: str) -> None:
 def restore(path: Path, settings: Settings, suite: str) -> Run:
     """The run that `save` wrote.
 
-    Raises UserError if there is none, or one of another suite or other settings; `steps` and
-    `episodes` may differ.
+    Raises UserError if there is none, or one of another suite or other settings than those of
+    FREE_TO_CHANGE.
     """
     if not path.exists():
         raise UserError(f"there is no run to resume in {path.parent}: look at --out")
@@ -502,8 +516,12 @@ def restore(path: Path, settings: Settings, suite: str) -> Run:
         policy.load_state_dict(saved["weights"])
     except Exception as error:  # torch.load raises many kinds for a damaged file
         raise UserError(f"{path} is damaged: remove its folder and train again") from error
-    free = {"steps": settings.steps, "episodes": settings.episodes}
-    if saved["suite"] != suite or {**saved["settings"], **free} != asdict(settings):
+    changed = [
+        name
+        for name, value in asdict(settings).items()
+        if name not in FREE_TO_CHANGE and saved["settings"].get(name) != value
+    ]
+    if saved["suite"] != suite or changed:
         raise UserError(f"{path} was trained with other settings: use those, or another --out")
     return Run(policy, saved["iteration"], saved["seconds"])
 
@@ -573,25 +591,21 @@ def train(
 
 
 def measure_job(
-    simulator: Simulator,
-    task: str,
-    goal_seed: int,
-    noise_seed: tuple[int, ...],
-    policy: GaussianPolicy,
-    settings: Settings,
+    goal: Goal, simulator: Simulator, policy: GaussianPolicy, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
     """The successes (T,) of one rollout before the inner step, and of one after it.
 
     Both take the means of the Gaussians. The inner step learns from `rollouts` others with the same
     start and goal.
     """
-    env = environment(simulator, task)
-    noise = draw_noise(policy, settings.rollouts, simulator.episode_steps, noise_seed)
-    no_noise = np.zeros_like(noise[:1])
-    before = roll_out(env, policy, goal_seed, no_noise)
-    support = to_batch(roll_out(env, policy, goal_seed, noise), settings)
-    after = roll_out(env, adapted_policy(policy, support, settings), goal_seed, no_noise)
-    report_progress(task, 1)
+    env = environment(simulator, goal.task)
+    T, A = simulator.episode_steps, len(policy.log_std)
+    noise = draw_noise(goal, settings.rollouts, T, A)
+    no_noise = np.zeros((1, T, A), dtype=np.float32)
+    before = roll_out(env, policy, goal, no_noise)
+    support = to_batch(roll_out(env, policy, goal, noise), settings)
+    after = roll_out(env, adapted_policy(policy, support, settings), goal, no_noise)
+    report_progress(goal.task, 1)
     return before.successes[0], after.successes[0]
 
 
@@ -603,17 +617,14 @@ def measure(
     workers: int | None,
 ) -> dict[str, Outcomes]:
     """Rolls the policy out on new goals of each task, before and after an inner step."""
-    jobs = [
-        {
-            "simulator": simulator,
-            "task": task,
-            "goal_seed": evaluation_seed(settings.seed, i),
-            "noise_seed": (MEASURING, settings.seed, i),
-            "policy": policy,
-            "settings": settings,
-        }
+    goals = [
+        Goal(task, seed=evaluation_seed(settings.seed, i), noise_seed=(MEASURING, settings.seed, i))
         for task in tasks
         for i in range(settings.episodes)
+    ]
+    jobs = [
+        {"goal": goal, "simulator": simulator, "policy": policy, "settings": settings}
+        for goal in goals
     ]
     results = run_jobs(
         measure_job, jobs, workers=workers, total=len(jobs), description="evaluating", unit="goal"
@@ -623,9 +634,9 @@ def measure(
         outcome = Outcomes(
             any_step={task: [] for task in tasks}, at_end={task: [] for task in tasks}
         )
-        for job, steps in zip(jobs, successes):
-            outcome.any_step[job["task"]].append(bool(steps.any()))
-            outcome.at_end[job["task"]].append(bool(steps[-1]))
+        for goal, steps in zip(goals, successes):
+            outcome.any_step[goal.task].append(bool(steps.any()))
+            outcome.at_end[goal.task].append(bool(steps[-1]))
         outcomes[label] = outcome
     return outcomes
 

@@ -214,6 +214,11 @@ def made_by_simulator(demonstrations: Demonstrations) -> bool:
     return "simulator" in demonstrations.meta
 
 
+def has_expert(simulator: Simulator) -> bool:
+    """Whether an expert records the demonstrations; otherwise a user has to import them."""
+    return "made_by" not in simulator.recipe
+
+
 def check_recipe(demonstrations: Demonstrations, path: str | Path, recipe: dict[str, Any]) -> None:
     """Raises UserError for a recording, read from `path`, that was not made by this recipe."""
     if "simulator" in recipe and not made_by_simulator(demonstrations):
@@ -274,7 +279,7 @@ def collect(
     missing = missing_tasks(simulator, paths, episodes, seed)
     if not missing:
         return paths  # the folder may be read-only
-    if "made_by" in simulator.recipe:
+    if not has_expert(simulator):
         raise UserError(
             f"{paths[missing[0]]} is missing or holds fewer than {episodes} demonstrations: make "
             f"it by {simulator.recipe['made_by']}"
@@ -313,14 +318,16 @@ def missing_tasks(
 
     Raises UserError for a file that was made in another way.
     """
+    recipe = dict(simulator.recipe)
+    if has_expert(simulator):
+        recipe["seed"] = seed
     missing = []
     for task, path in paths.items():
         if not path.exists():
             missing.append(task)
             continue
         demonstrations = load_demonstrations(path)
-        by_expert = {} if "made_by" in simulator.recipe else {"seed": seed}
-        check_recipe(demonstrations, path, {**simulator.recipe, **by_expert})
+        check_recipe(demonstrations, path, recipe)
         if demonstrations.task != task:
             raise UserError(
                 f"{path} is a recording of {demonstrations.task}: move it or use another --data"
@@ -447,7 +454,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for task, path in paths.items():
         demonstrations = load_demonstrations(path)
         expert, seconds = "", ""  # of what was imported
-        if "made_by" not in simulator.recipe:
+        if has_expert(simulator):
             expert = f"{demonstrations.meta['expert_success_rate']:.0%}"
             seconds = f"{demonstrations.meta['seconds']:.1f}"
         rows.append(

@@ -510,8 +510,9 @@ class Emulator:
         with self.lock:
             now = time.monotonic()
             self.previous = {name: self.inputs.get(name, 0) for name in values}
-            self.inputs |= values
-            self.written |= dict.fromkeys(values, now)
+            for name, value in values.items():
+                self.inputs[name] = value
+                self.written[name] = now
             if values.get("speed_slider_mask"):
                 self.faults.slider = values["speed_slider_fraction"]
             self.received.append((now, values))

@@ -205,8 +205,8 @@ def fuzz_pose(seed: int) -> tuple[float, float]:
         arm.servo.go(target)
         metres, radians = lengths(pose_difference(start, target))
         needed = 4 * max(metres / arm.servo.speed[0], radians / arm.servo.speed[1])
-        left = lengths(pose_difference(arm.pose, target))
-        assert left[0] < 5e-3 and left[1] < 5e-3, (seed, start, target, left)
+        metres_left, radians_left = lengths(pose_difference(arm.pose, target))
+        assert metres_left < 5e-3 and radians_left < 5e-3, (seed, start, target)
         return arm.now - began, needed
 
 

@@ -243,7 +243,7 @@ def make_observations(frames, goal=(0.3, 0.05, 0.88), box=BOX, cameras=CAMERAS):
     """The observations of an episode, without images, and the depth of each camera, metres."""
     misc = {"variation_index": 0, "joint_poses": [np.zeros(7)] * 7}
     for camera in cameras:
-        misc |= camera_misc(camera)
+        misc.update(camera_misc(camera))
     poses = path_of_gripper(frames, goal)
     observations = [
         Observation(

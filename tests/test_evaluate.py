@@ -329,9 +329,9 @@ def test_of_pairs_it_is_told_how_often_the_other_task_was_done(run, recordings, 
         episodes=2,
     )
     assert outcomes.other_task == {"touch-red": [True] * 2, "touch-green": [False] * 2}
-    report.write_report(evaluate.Path("pairs"), {"a": outcomes}, {}, pooled=True)
-    assert report.read_outcomes(evaluate.Path("pairs")) == {"a": outcomes}
-    assert "the other task" in evaluate.Path("pairs/success.md").read_text()
+    report.write_report(Path("pairs"), {"a": outcomes}, {}, pooled=True)
+    assert report.read_outcomes(Path("pairs")) == {"a": outcomes}
+    assert "the other task" in Path("pairs/success.md").read_text()
 
 
 def test_a_rollout_ends_without_success_where_nothing_is_seen(run, recordings):
@@ -340,7 +340,7 @@ def test_a_rollout_ends_without_success_where_nothing_is_seen(run, recordings):
             environment = super().make(task, num_points)
             observe, advance = environment.observe, environment.advance
 
-            def observe_twice():
+            def observe_at_first():
                 if environment.steps > 4:
                     raise simulator.OutOfSightError("gone")
                 return observe()
@@ -349,7 +349,7 @@ def test_a_rollout_ends_without_success_where_nothing_is_seen(run, recordings):
                 reward, truncated, _ = advance(action)
                 return reward, truncated, {"success": True}
 
-            environment.observe, environment.advance = observe_twice, always_successful
+            environment.observe, environment.advance = observe_at_first, always_successful
             return environment
 
     outcomes = evaluate.evaluate_checkpoint(
