@@ -12,7 +12,8 @@ Letters: N points of an observation.
 import warnings
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from typing import Any, ClassVar
 
 import gymnasium
 import mujoco
@@ -157,6 +158,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         sawyer_env.seeded_rand_vec = True  # ... from a generator of its own, not NumPy's global
         sawyer_env._partially_observable = False  # the expert needs the goal
         del sawyer_env.sawyer_observation_space  # cached with the goal hidden: clips it to zero
+        sawyer_env.touching_object = partial(touching_object, sawyer_env)
         self.sawyer_env = sawyer_env
         self.expert = ENV_POLICY_MAP[f"{task}-v3"]()
         self.expert_brings_fingertips = task in FINGERTIP_TASKS
@@ -284,6 +286,23 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
     def close(self) -> None:
         self.sawyer_env.close()
+
+
+def touching_object(sawyer_env: Any, object_geom_id: int) -> bool:
+    """Whether both fingers press on a geom.
+
+    It says what Meta-World's method of this name says, and takes its place: that one goes through
+    all contacts in Python, which takes half the time of a step of pick-place.
+    """
+    data = sawyer_env.data
+    geoms = data.contact.geom  # (contacts, 2)
+    of_object = (geoms == object_geom_id).any(axis=1)
+
+    def force(pad: str) -> float:
+        of_both = of_object & (geoms == data.geom(pad).id).any(axis=1)
+        return data.efc_force[data.contact.efc_address[of_both]].sum()
+
+    return force("leftpad_geom") > 0 and force("rightpad_geom") > 0
 
 
 if "DAMI/MetaWorld-v0" not in gymnasium.registry:

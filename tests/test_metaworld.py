@@ -158,6 +158,19 @@ def test_advance_and_observe_make_a_step(reach):
         np.testing.assert_array_equal(observation[key], value)
 
 
+def test_touching_is_what_metaworlds_own_loops_say():
+    env = MetaWorldPointCloudEnv("pick-place")
+    env.begin(0)
+    sawyer_env = env.sawyer_env
+    puck = sawyer_env._get_id_main_object()
+    ours, metaworlds = [], []
+    for _ in range(80):
+        env.advance(env.expert_action())
+        ours.append(bool(sawyer_env.touching_object(puck)))
+        metaworlds.append(type(sawyer_env).touching_object(sawyer_env, puck))
+    assert ours == metaworlds and 20 < sum(ours) < 60  # it grasps the puck on the way
+
+
 def test_an_episode_ends_at_200_steps_and_tells_success_each_step(reach):
     reach.begin(0)
     truncated, success = [], []
