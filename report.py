@@ -265,11 +265,16 @@ def read_outcomes(folder: Path) -> dict[str, Outcomes]:
 
 
 def plot_success(
-    columns: dict[str, Successes], path: Path, title: str, paper: PaperColumns | None = None
+    columns: dict[str, Successes],
+    path: Path,
+    title: str,
+    paper: PaperColumns | None = None,
+    parts: dict[str, Sequence[str]] | None = None,
 ) -> None:
     """Writes a bar chart of success with Wilson intervals, a group of bars for each task.
 
-    Arguments as of `success_table`; `path` is that of a PNG.
+    Arguments as of `success_table`; `path` is that of a PNG. Parts, whose tasks stand side by side,
+    have their names above them and a line between them.
     """
     from matplotlib.figure import Figure  # takes a second to import
 
@@ -298,8 +303,15 @@ def plot_success(
         heights = [rates.get(task, math.nan) for task in tasks]  # no bar where it has none
         axes.bar(places + i * width, heights, width, color=str(gray), label=label)
 
-    axes.set_xticks(places + width * (n_bars - 1) / 2, tasks, rotation=30, ha="right")
-    axes.set(ylabel="success, %", ylim=(0, 105), title=title)
+    middles = places + width * (n_bars - 1) / 2
+    for name, of_part in (parts or {}).items():
+        first, last = tasks.index(of_part[0]), tasks.index(of_part[-1])
+        axes.text((middles[first] + middles[last]) / 2, 104, name, ha="center", fontsize=9)
+        if first > 0:
+            axes.axvline(middles[first] - 0.5, color="black", linestyle=":", linewidth=1)
+
+    axes.set_xticks(middles, tasks, rotation=30, ha="right")
+    axes.set(ylabel="success, %", ylim=(0, 112 if parts else 105), title=title)
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(frameon=False, ncols=n_bars, loc="outside upper center", fontsize=8)
     save_png(figure, path, dpi=120)

@@ -90,8 +90,8 @@ def arrow(
 # The network
 panel(0.5, 1, 109, 44.5, "The network")
 box(2, 31, 19, "Instruction", "one sentence", DATA)
-box(2, 18, 19, "Demonstration", "one complete episode:\n(T, N, P), (T, S), (T, A)", DATA)
-box(2, 5, 19, "Observation", "now and just before:\n(To, N, P), (To, S)", DATA)
+box(2, 18, 19, "Demonstration", "one complete episode", DATA)
+box(2, 5, 19, "Observation", "now and just before", DATA)
 
 box(29, 31, 16, "CLIP", "text tower", FROZEN)
 box(29, 5, 16, "PointNet + MLP", "a frame to a feature,\nthe same weights\nfor both", NETWORK, 21)
@@ -102,8 +102,9 @@ box(93, 5, 15, "U-Net", "first level:\nFiLM by U2T\n(TCFM);\nothers: by $h_k$", 
 box(93, 33, 15, "Actions", "(H, A) = (16, A),\nTa executed", DATA)
 
 arrow((21, 35), (29, 35))
-arrow((21, 22), (29, 22))
-arrow((21, 9), (29, 9))
+arrow((21, 22), (29, 22), text="(T, N, P)\n(T, S)", at=(24.7, 24.5))
+arrow((21, 9), (29, 9), text="(To, N, P)\n(To, S)", at=(24.8, 11.5))
+arrow((11.5, 26), (11.5, 28.5), (59.75, 28.5), (59.75, 26), text="actions (T, A)", at=(49, 29.7))
 arrow((45, 35), (81.5, 35), (81.5, 26), text="(512)", at=(62, 36.3))
 arrow((45, 22), (53, 22), text="(T, feature)", at=(49, 25))
 arrow((45, 9), (53, 9), text="(To, feature)", at=(49, 12))
@@ -114,6 +115,12 @@ arrow((88, 22), (93, 22), text="(C)", at=(90.5, 23.4))
 arrow((97, 26), (97, 33), text=r"$\hat A_0$", at=(95.2, 29.5))
 arrow((104, 33), (104, 26), text="next $A_k$", at=(107, 29.5))
 arrow((100.5, 1.8), (100.5, 5), text="starts from noise; k falls to 0", at=(88.5, 2.8))
+
+letters = (
+    "T frames of the demonstration, To = 2 of the observation; N points of P numbers, states of S, "
+    "actions of A;\nH actions are planned, Ta of them executed; C numbers condition the U-Net"
+)
+axes.text(20, 43.0, letters, fontsize=8, color=INK, va="center")
 
 # Meta-training
 panel(0.5, -37, 65, 36.5, "Meta-training (Algorithm 1)")

@@ -71,19 +71,21 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "ml10-neither": "without both: multi-task training",
     "ml10-30-demonstrations": "multi-task training, thirty demonstrations",
     "ml10-scratch": "from random weights",
-    "ml10-scratch-eight": "eight actions of ten steps: from random weights",
-    "ml10-dami-eight": "eight actions of ten steps: DAMI",
-    "ml10-inner-3e-2": "eight actions of ten steps: DAMI with an inner rate of 3e-2",
-    "ml10-no-inner-loop-eight": "eight actions of ten steps: without the inner loop",
-    "ml10-neither-eight": "eight actions of ten steps: multi-task training",
     "ml45-no-inner-loop": "ML45, without the inner loop",
-    "before": "until 2026-11-23: the instruction always told, inner rate 1e-4, DDIM, eight of ten",
-    "before-no-inner-loop": "until 2026-11-23, without the inner loop",
+}
+OLDER = {  # the same of earlier recipes
+    "ml10-scratch-eight": "from random weights",
+    "ml10-dami-eight": "DAMI",
+    "ml10-inner-3e-2": "DAMI with an inner rate of 3e-2",
+    "ml10-no-inner-loop-eight": "without the inner loop",
+    "ml10-neither-eight": "multi-task training",
+    "before": "DAMI, until 2026-11-23",
+    "before-no-inner-loop": "without the inner loop, until 2026-11-23",
 }
 SWAPPED = {  # a run -> its panel in the swap chart
-    "before-seed0": "until 2026-11-23",
+    "before-seed0": "always told, until 2026-11-23",
     "ml10-dami-seed0": "DAMI, seed 0",
-    "ml10-no-inner-loop-cpu-seed0": "what ships",
+    "ml10-no-inner-loop-cpu-seed0": "without the inner loop, seed 0",
 }
 POLICIES = {  # of baselines.py -> what the paper calls it
     policy: name for policy, name in PAPER_NAMES.items() if policy not in ("dami", "rl")
@@ -315,10 +317,10 @@ def difficulty_table(results: Results, suite: str = "ml10") -> str:
     return format_table(rows)
 
 
-def variants_table(results: Results) -> str:
+def variants_table(results: Results, variants: dict[str, str]) -> str:
     """What decides: a row a variant of ML10; ML45 has a table of its own."""
     rows = [["ML10", "base", "novel, no gradient step", "novel, 200 steps"]]
-    for variant, title in VARIANTS.items():
+    for variant, title in variants.items():
         cells = [mean(results, variant, column) for column in (BASE, BEFORE, AFTER)]
         if any(cells) and not variant.startswith("ml45"):
             rows.append([title, *cells])
@@ -442,7 +444,7 @@ def swap_table(results: Results) -> str:
 def reading_table(results: Results) -> str:
     """A row a run that is told nothing: success with its own demonstration, with another task's."""
     rows = [["run", "own demonstration alone", "another's demonstration alone"]]
-    for variant, title in VARIANTS.items():
+    for variant, title in {**VARIANTS, **OLDER}.items():
         for run in runs_of(results, variant):
             if "swap" in run:
                 cells = [pooled_success(measured(run, Column("swap", place))) for place in (0, 1)]
@@ -511,7 +513,8 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "base": lambda results: by_task_table(results, "base"),
     "novel": lambda results: by_task_table(results, "novel"),
     "difficulty": difficulty_table,
-    "variants": variants_table,
+    "variants": lambda results: variants_table(results, VARIANTS),
+    "older": lambda results: variants_table(results, OLDER),
     "policies": policies_table,
     "ablation": ablation_table,
     "length": length_table,
@@ -543,11 +546,13 @@ def fill(text: str, results: Results) -> str:
 def plot_swap(results: Results, path: Path) -> None:
     """Writes a chart with a bar for each thing that a policy can be shown, a panel a policy."""
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     policies = {title: columns for title, columns in swaps(results).items() if columns}
     labels = list(max(policies.values(), key=len))
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    figure = Figure(figsize=(8.5, 3.4), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(policies), sharey=True))
+    colors = {"all that it sees is of its task": "C0", "part of it is of another task": "C3"}
     for axes, (title, columns) in zip(panels, policies.items()):
         for place, label in enumerate(labels):
             if label not in columns:
@@ -556,12 +561,15 @@ def plot_swap(results: Results, path: Path) -> None:
             episodes = [success for of_task in columns[label].values() for success in of_task]
             rate, bounds = np.mean(episodes), wilson_interval(sum(episodes), len(episodes))
             error = 100 * np.abs(np.array(bounds)[:, None] - rate)  # (2, 1)
-            color = "C3" if "another" in label else "C0"
+            own, other = colors.values()
+            color = other if "another" in label else own
             axes.barh(place, 100 * rate, xerr=error, color=color, capsize=2)
         axes.set_yticks(range(len(labels)), labels, fontsize=8)
         axes.set(xlabel="success, %", xlim=(0, 100), ylim=(len(labels) - 0.4, -0.6))
-        axes.set_title(title, fontsize=10)
+        axes.set_title(title, fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
+    handles = [Patch(color=color, label=label) for label, color in colors.items()]
+    figure.legend(handles=handles, ncols=2, loc="outside upper center", frameon=False, fontsize=8)
     save_png(figure, path, dpi=120)
 
 
@@ -672,8 +680,11 @@ def plot_by_task(results: Results, path: Path) -> None:
             for split, column in MEASURED_BY.items()
             for task in TASKS["ml10"][split]
         }
-    title = "base tasks directly, novel tasks (the last five) after 200 steps"
-    plot_success(columns, path, title, paper_columns("ml10", ["dami"]))
+    parts = {
+        "base tasks, as trained": TASKS["ml10"]["base"],
+        "novel tasks, after 200 gradient steps": TASKS["ml10"]["novel"],
+    }
+    plot_success(columns, path, "Success on ML10", paper_columns("ml10", ["dami"]), parts)
 
 
 # ---- Comparing, and shipping ---------------------------------------------------------------------
