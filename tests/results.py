@@ -508,6 +508,28 @@ def hidden_goals_table(results: Results, skill: str) -> str:
     return format_table(rows)
 
 
+# The most important of these, for README: what a policy has, the variant, and its report.
+HIDDEN_SUMMARY = (
+    ("a demonstration of the goal", "demonstration", Column("novel", 0)),
+    ("a demonstration of another goal", "demonstration", Column("novel", 2)),
+    ("zeros in its place", "demonstration", Column("novel", 1)),
+    ("no demonstration, second-order MAML: before any step", "inner", Column("0-steps")),
+    ("the same, after one inner step", "inner", Column("1-steps")),
+    ("first-order MAML, after one inner step", "inner-first-order", Column("1-steps")),
+    ("multi-task training, one step at its best rate", "neither", Column("1-steps-best-rate")),
+)
+
+
+def hidden_summary_table(results: Results) -> str:
+    """The success at the end on novel goals: a row for what a policy has, a column a skill."""
+    skills = ("reach", "push")
+    rows = [["success at the end, percent", *skills]]
+    for title, variant, column in HIDDEN_SUMMARY:
+        at_end = replace(column, at_end=True)
+        rows.append([title, *(mean(results, f"goals-{s}-{variant}", at_end) for s in skills)])
+    return format_table(rows)
+
+
 TABLES: dict[str, Callable[[Results], str]] = {
     "means": means_table,
     "base": lambda results: by_task_table(results, "base"),
@@ -524,6 +546,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),
     "ml45 novel": lambda results: by_task_table(results, "novel", "ml45"),
     "looks": looks_table,
+    "goals": hidden_summary_table,
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
     "goals push": lambda results: hidden_goals_table(results, "push"),
     "swap": swap_table,
