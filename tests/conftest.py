@@ -4,10 +4,7 @@ import functools
 import hashlib
 import os
 import signal
-import subprocess
-import sys
 from contextlib import contextmanager
-from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before torch; on small matrices threads wait
 
@@ -33,20 +30,6 @@ FEW = (
     "--suite ml10 --preset tiny --steps 6 --checkpoint-every 3 --demonstrations 2 --episodes 0 "
     "--clip-weights random --device cpu"
 ).split()
-
-
-def pytest_collection_finish(session):
-    """The tutorial, cut short, takes half a minute: it runs beside the tests before its own."""
-    if any(item.name == "test_the_tutorial_runs" for item in session.items):
-        command = [sys.executable, str(Path(__file__).with_name("test_notebook.py"))]
-        options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-        session.config.tutorial = subprocess.Popen(command, **options)
-
-
-def pytest_unconfigure(config):
-    """Nor does it outlive them."""
-    if hasattr(config, "tutorial"):
-        config.tutorial.kill()
 
 
 @pytest.fixture(scope="session")

@@ -3,27 +3,17 @@
 import ast
 import base64
 import builtins
-import os
 import re
 from pathlib import Path
 
 import nbformat
 from nbclient import NotebookClient
 
+from metaworld_env import INSTRUCTIONS
+
 ROOT = Path(__file__).parents[1]
 TUTORIAL = ROOT / "tutorial.ipynb"
 QUICK = "QUICK: trainings and rollouts are cut short"  # what a run that is cut short prints
-
-
-def execute():
-    """Runs all cells, trainings and rollouts cut short; raises what one of them raises.
-
-    Its cells assert what their texts claim, as far as that does not need the full length.
-    """
-    os.environ["DAMI_TUTORIAL_QUICK"] = "1"  # the kernel inherits it
-    notebook = nbformat.read(TUTORIAL, as_version=4)
-    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
-    assert QUICK in printed(notebook)
 
 
 def sections():
@@ -99,8 +89,6 @@ def test_a_section_of_the_tutorial_needs_the_set_up_and_nothing_else():
 
 
 def test_a_task_is_named_in_one_cell_of_the_tutorial():
-    from metaworld_env import INSTRUCTIONS  # not above: as a script, this file sees no modules
-
     setup, *others = sections().values()
     for tree in [*setup[1:], *(tree for cells in others for tree in cells)]:
         strings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
@@ -119,10 +107,9 @@ def test_the_tutorial_asserts_what_it_claims():
         assert claim in checked, claim
 
 
-def test_the_tutorial_runs(pytestconfig):
-    error = pytestconfig.tutorial.communicate(timeout=600)[1]  # conftest.py started it
-    assert pytestconfig.tutorial.returncode == 0, error
-
-
-if __name__ == "__main__":
-    execute()
+def test_the_tutorial_runs(monkeypatch):
+    """Trainings and rollouts are cut short, as are its assertions that need the full length."""
+    monkeypatch.setenv("DAMI_TUTORIAL_QUICK", "1")  # the kernel inherits it
+    notebook = nbformat.read(TUTORIAL, as_version=4)
+    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
+    assert QUICK in printed(notebook)
