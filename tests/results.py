@@ -3,7 +3,7 @@
     python -m tests.results runs/ml10-dami-seed0   # takes a run of tests.runs into RESULTS.json
     python -m tests.results                        # writes the tables, draws the charts
     python -m tests.results --compare ml10-dami ml10-neither    # episodes won and lost, sign test
-    python -m tests.results --ship CHECKPOINT      # makes it assets/SUITE-small.pt, float16
+    python -m tests.results --ship RUN             # makes it assets/SUITE-small.pt, float16
 
 RESULTS.json holds for each run how it was trained and, for each report that measured it, every
 episode (1: success, 0: not) with the command, hardware, seed and date.
@@ -23,7 +23,7 @@ from scipy.stats import binomtest
 import model
 from common import command_line, format_table, read_json_lines
 from data import write_text
-from evaluate import SHIPPED_CHECKPOINT, TRAINED, load_trained
+from evaluate import SHIPPED_CHECKPOINT, TRAINED, checkpoints_of, load_trained
 from model import CheckpointError
 from report import (
     PAPER_NAMES,
@@ -467,6 +467,7 @@ def looks_table(results: Results) -> str:
 # What is measured on goals that no observation tells: a title, the variant, and its report.
 HIDDEN_ROWS = (
     ("with the goal's own demonstration", "demonstration", Column("novel", 0)),
+    ("the same, from 20 starts", "demonstration", Column("starts")),
     ("with another goal's", "demonstration", Column("novel", 2)),
     ("with zeros in its place", "demonstration", Column("novel", 1)),
     ("with its last frame alone", "demonstration", Column("parts", 1)),
@@ -522,7 +523,7 @@ HIDDEN_SUMMARY = (
 
 def hidden_summary_table(results: Results) -> str:
     """The success at the end on novel goals: a row for what a policy has, a column a skill."""
-    skills = ("reach", "push")
+    skills = ("reach", "push", "pick-place")
     rows = [["success at the end, percent", *skills]]
     for title, variant, column in HIDDEN_SUMMARY:
         at_end = replace(column, at_end=True)
@@ -549,6 +550,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "goals": hidden_summary_table,
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
     "goals push": lambda results: hidden_goals_table(results, "push"),
+    "goals pick-place": lambda results: hidden_goals_table(results, "pick-place"),
     "swap": swap_table,
     "reading": reading_table,
 }
@@ -741,9 +743,10 @@ def compare(results: Results, one: str, other: str) -> str:
     return format_table(rows)
 
 
-def ship(checkpoint: str) -> None:
-    """Writes assets/SUITE-small.pt: a checkpoint in float16 that is rolled out as `small` is."""
+def ship(run: str) -> None:
+    """Writes assets/SUITE-small.pt: a run's last checkpoint in float16, rolled out as `small` is."""
     small = model.PRESETS["small"]
+    checkpoint = checkpoints_of(run)[-1]
     policy, info = load_trained(
         checkpoint, n_action_steps=small.n_action_steps, inference_steps=small.inference_steps
     )
@@ -757,7 +760,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("runs", nargs="*", help="folders of tests.runs to take into RESULTS.json")
     add("--compare", nargs=2, metavar="VARIANT", help="episodes that the first wins and loses")
-    add("--ship", metavar="CHECKPOINT", help="make it assets/SUITE-small.pt")
+    add("--ship", metavar="RUN", help="make its last checkpoint assets/SUITE-small.pt")
     return parser.parse_args(argv)
 
 
