@@ -744,7 +744,7 @@ def compare(results: Results, one: str, other: str) -> str:
 
 
 def ship(run: str) -> None:
-    """Writes assets/SUITE-small.pt: a run's last checkpoint in float16, rolled out as `small` is."""
+    """Writes assets/SUITE-small.pt: the last checkpoint, in float16, rolled out as `small` is."""
     small = model.PRESETS["small"]
     checkpoint = checkpoints_of(run)[-1]
     policy, info = load_trained(
