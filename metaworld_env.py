@@ -289,7 +289,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
 
 def touching_object(sawyer_env: Any, object_geom_id: int) -> bool:
-    """Whether both fingers press on a geom.
+    """Whether both fingers press on the geom of this number.
 
     It says what Meta-World's method of this name says, and takes its place: that one goes through
     all contacts in Python, which takes half the time of a step of pick-place.
@@ -298,11 +298,11 @@ def touching_object(sawyer_env: Any, object_geom_id: int) -> bool:
     geoms = data.contact.geom  # (contacts, 2)
     of_object = (geoms == object_geom_id).any(axis=1)
 
-    def force(pad: str) -> float:
+    def force(pad: str) -> float:  # with which a finger's pad and the object press on each other
         of_both = of_object & (geoms == data.geom(pad).id).any(axis=1)
         return data.efc_force[data.contact.efc_address[of_both]].sum()
 
-    return force("leftpad_geom") > 0 and force("rightpad_geom") > 0
+    return bool(force("leftpad_geom") > 0 and force("rightpad_geom") > 0)
 
 
 if "DAMI/MetaWorld-v0" not in gymnasium.registry:

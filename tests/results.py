@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -444,7 +445,7 @@ def swap_table(results: Results) -> str:
 def reading_table(results: Results) -> str:
     """A row a run that is told nothing: success with its own demonstration, with another task's."""
     rows = [["run", "own demonstration alone", "another's demonstration alone"]]
-    for variant, title in {**VARIANTS, **OLDER}.items():
+    for variant, title in chain(VARIANTS.items(), OLDER.items()):
         for run in runs_of(results, variant):
             if "swap" in run:
                 cells = [pooled_success(measured(run, Column("swap", place))) for place in (0, 1)]
@@ -509,25 +510,26 @@ def hidden_goals_table(results: Results, skill: str) -> str:
     return format_table(rows)
 
 
-# The most important of these, for README: what a policy has, the variant, and its report.
-HIDDEN_SUMMARY = (
-    ("a demonstration of the goal", "demonstration", Column("novel", 0)),
-    ("a demonstration of another goal", "demonstration", Column("novel", 2)),
-    ("zeros in its place", "demonstration", Column("novel", 1)),
-    ("no demonstration, second-order MAML: before any step", "inner", Column("0-steps")),
-    ("the same, after one inner step", "inner", Column("1-steps")),
-    ("first-order MAML, after one inner step", "inner-first-order", Column("1-steps")),
-    ("multi-task training, one step at its best rate", "neither", Column("1-steps-best-rate")),
-)
+HIDDEN_SUMMARY = {  # the most important of these rows -> their titles in README
+    "with the goal's own demonstration": "a demonstration of the goal",
+    "with another goal's": "a demonstration of another goal",
+    "with zeros in its place": "zeros in its place",
+    "second order: before any step": "no demonstration, second-order MAML: before any step",
+    "second order: 1 inner step": "the same, after one inner step",
+    "first order: 1 inner step": "first-order MAML, after one inner step",
+    "multi-task: 1 step at its best rate": "multi-task training, one step at its best rate",
+}
 
 
 def hidden_summary_table(results: Results) -> str:
     """The success at the end on novel goals: a row for what a policy has, a column a skill."""
     skills = ("reach", "push", "pick-place")
     rows = [["success at the end, percent", *skills]]
-    for title, variant, column in HIDDEN_SUMMARY:
-        at_end = replace(column, at_end=True)
-        rows.append([title, *(mean(results, f"goals-{s}-{variant}", at_end) for s in skills)])
+    for title, variant, column in HIDDEN_ROWS:
+        if title in HIDDEN_SUMMARY:
+            at_end = replace(column, at_end=True)
+            cells = [mean(results, f"goals-{skill}-{variant}", at_end) for skill in skills]
+            rows.append([HIDDEN_SUMMARY[title], *cells])
     return format_table(rows)
 
 
@@ -577,7 +579,7 @@ def plot_swap(results: Results, path: Path) -> None:
     labels = list(max(policies.values(), key=len))
     figure = Figure(figsize=(8.5, 3.4), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(policies), sharey=True))
-    colors = {"all that it sees is of its task": "C0", "part of it is of another task": "C3"}
+    own_color, other_color = "C0", "C3"
     for axes, (title, columns) in zip(panels, policies.items()):
         for place, label in enumerate(labels):
             if label not in columns:
@@ -586,15 +588,17 @@ def plot_swap(results: Results, path: Path) -> None:
             episodes = [success for of_task in columns[label].values() for success in of_task]
             rate, bounds = np.mean(episodes), wilson_interval(sum(episodes), len(episodes))
             error = 100 * np.abs(np.array(bounds)[:, None] - rate)  # (2, 1)
-            own, other = colors.values()
-            color = other if "another" in label else own
+            color = other_color if "another" in label else own_color
             axes.barh(place, 100 * rate, xerr=error, color=color, capsize=2)
         axes.set_yticks(range(len(labels)), labels, fontsize=8)
         axes.set(xlabel="success, %", xlim=(0, 100), ylim=(len(labels) - 0.4, -0.6))
         axes.set_title(title, fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
-    handles = [Patch(color=color, label=label) for label, color in colors.items()]
-    figure.legend(handles=handles, ncols=2, loc="outside upper center", frameon=False, fontsize=8)
+    legend = [
+        Patch(color=own_color, label="all that it sees is of its task"),
+        Patch(color=other_color, label="part of it is of another task"),
+    ]
+    figure.legend(handles=legend, ncols=2, loc="outside upper center", frameon=False, fontsize=8)
     save_png(figure, path, dpi=120)
 
 

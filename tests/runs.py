@@ -138,7 +138,7 @@ def hidden_reports() -> dict[str, tuple[str, Sequence[str]]]:
     novel = "evaluate.py --split novel --checkpoint {run}"
     reports = {
         "novel": (f"{novel} --swap demonstration --controls zeros", ("demonstration", "both")),
-        # Five starts are few where some are hard: the same ones for all goals.
+        # All goals share their starts, and five are few where some of them are hard.
         "starts": (f"{novel} --episodes 20", ("demonstration",)),
         "parts": (f"{novel} --controls last-frame no-actions shuffled", ("demonstration",)),
         "0-steps": (novel, (*ADAPTED, *MULTI_TASK)),

@@ -139,6 +139,19 @@ def test_a_chart_has_a_bar_for_each_column_and_task_with_its_interval(figures, t
     assert len({round(left, 3) for left in lefts}) == len(lefts)  # side by side
 
 
+def test_parts_of_a_chart_have_names_and_a_line_between_them(figures, tmp_path):
+    columns = {"x": {"a": [True], "b": [False], "c": [True]}}
+    parts = {"first": ["a", "b"], "second": ["c"]}
+    report.plot_success(columns, tmp_path / "x.png", "A title", parts=parts)
+    [axes] = figures[0].axes
+    assert [(text.get_text(), text.get_position()[0]) for text in axes.texts] == [
+        ("first", pytest.approx(0.5)),
+        ("second", pytest.approx(2)),
+    ]
+    [line] = [line for line in axes.get_lines() if line.get_linestyle() == ":"]
+    assert list(line.get_xdata()) == pytest.approx([1.5, 1.5])
+
+
 def write_metrics(folder, measured):
     """20 steps whose loss falls from 2 to 0.1, and lines of what was measured."""
     lines = [{"step": step, "loss": 2.1 - 0.1 * step} for step in range(1, 21)] + measured
