@@ -22,7 +22,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -375,9 +375,8 @@ class StopRequest:
 
 # ---- Worker processes ----------------------------------------------------------------------------
 
-# The state of a worker process: the queue that `report_progress` writes to, and the setup that
-# `run_job` still has to call.
-worker: dict[str, Any] = {"progress": None, "setup": None}
+# In a worker process, the queue that `report_progress` writes to.
+worker: dict[str, Any] = {"progress": None}
 
 
 class WorkerPool:
@@ -387,25 +386,28 @@ class WorkerPool:
             for ...:
                 results = pool.run(job, jobs, bar)
 
+    They are started by the first call, and are no more than its jobs.
+
     Args:
-        workers: processes; None: one a core.
-        setup: called once in each process before its first job; a function of a module, or a
-            `functools.partial` of one.
+        workers: processes at most; None: one a core.
 
     Raises UserError if `workers` is below 1.
     """
 
-    def __init__(self, workers: int | None, setup: Callable[[], None] | None = None):
+    def __init__(self, workers: int | None):
         if workers is not None and workers < 1:
             raise UserError(f"--workers is {workers}: use at least 1")
-        context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
+        self.workers = workers or os.cpu_count() or 1
+        self.executor: ProcessPoolExecutor | None = None  # of the processes, once they are started
         self.existing_children = set(multiprocessing.active_children())
-        self.started = False  # whether a process ever was
+        self.working = False  # whether a process has said so
+
+    def start(self, workers: int) -> None:
+        """Starts the processes, or rather has the first job start them."""
+        context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
         with ignored_signals():
             self.progress = context.SimpleQueue()
-            self.executor = ProcessPoolExecutor(
-                workers or os.cpu_count() or 1, context, start_worker, (self.progress, setup)
-            )
+            self.executor = ProcessPoolExecutor(workers, context, start_worker, (self.progress,))
 
     def run(
         self, job: Callable[..., Any], jobs: Sequence[dict[str, Any]], bar: tqdm | None = None
@@ -423,8 +425,10 @@ class WorkerPool:
             UserError: a worker process was killed or could not start.
             Exception: what a job raised. The other jobs are ended by then, and no process is left.
         """
+        if self.executor is None:
+            self.start(min(self.workers, max(1, len(jobs))))
         with ignored_signals():  # workers inherit that: a terminal sends Ctrl-C to them, too
-            futures = [self.executor.submit(run_job, job, arguments) for arguments in jobs]
+            futures = [self.executor.submit(job, **arguments) for arguments in jobs]
         finished = False
         try:
             pending = set(futures)
@@ -432,7 +436,7 @@ class WorkerPool:
                 done, pending = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
                 while not self.progress.empty():
                     text, amount = self.progress.get()
-                    self.started = True
+                    self.working = True
                     if bar is not None:
                         bar.set_postfix_str(text)
                         bar.update(amount)
@@ -441,7 +445,7 @@ class WorkerPool:
             finished = True
             return [future.result() for future in futures]
         except BrokenProcessPool:
-            if self.started:
+            if self.working:
                 problem = "a worker process was killed, perhaps for memory: try fewer --workers"
             else:
                 problem = (
@@ -455,6 +459,8 @@ class WorkerPool:
 
     def end(self, at_once: bool = False) -> None:
         """Ends the processes, after the jobs at hand or `at_once`, and waits for them."""
+        if self.executor is None:
+            return
         with ignored_signals():
             if at_once:
                 for process in set(multiprocessing.active_children()) - self.existing_children:
@@ -476,21 +482,23 @@ def run_jobs(
     total: int,
     description: str,
     unit: str = "episode",
-    setup: Callable[[], None] | None = None,
+    pool: WorkerPool | None = None,
 ) -> list:
-    """Calls jobs in a `WorkerPool` that lives as long as they do, with a progress bar.
+    """Calls jobs in the processes of a `WorkerPool`, with a progress bar.
 
     Args:
-        job, jobs, workers, setup: see `WorkerPool`.
+        job, jobs: see `WorkerPool.run`.
+        workers: see `WorkerPool`; it is not read where there is a `pool`.
         total, description, unit: what the progress bar counts to, its name, what it counts.
+        pool: whose processes work; None: those of a pool that lives as long as the jobs.
 
     Returns and raises what `WorkerPool.run` does.
     """
-    if workers is None:
-        workers = os.cpu_count() or 1
-    with WorkerPool(min(workers, max(1, len(jobs))), setup) as pool:
-        with progress_bar(total=total, desc=description, unit=unit) as bar:
-            return pool.run(job, jobs, bar)
+    with ExitStack() as stack:
+        if pool is None:
+            pool = stack.enter_context(WorkerPool(workers))
+        bar = stack.enter_context(progress_bar(total=total, desc=description, unit=unit))
+        return pool.run(job, jobs, bar)
 
 
 @contextmanager
@@ -510,7 +518,7 @@ def ignored_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def start_worker(progress: Any, setup: Callable[[], None] | None) -> None:
+def start_worker(progress: Any) -> None:
     """Prepares a worker process, which ends as soon as the one that started it is gone."""
 
     def end_with_parent() -> None:
@@ -519,16 +527,8 @@ def start_worker(progress: Any, setup: Callable[[], None] | None) -> None:
 
     threading.Thread(target=end_with_parent, daemon=True).start()
     torch.set_num_threads(1)  # the other cores have processes of their own
-    worker.update(progress=progress, setup=setup)
+    worker["progress"] = progress
     report_progress("", 0)  # the process has started
-
-
-def run_job(job: Callable[..., Any], arguments: dict[str, Any]) -> Any:
-    # `setup` is not called in `start_worker`: an exception there would break the whole pool.
-    if worker["setup"] is not None:
-        worker["setup"]()
-        worker["setup"] = None
-    return job(**arguments)
 
 
 def report_progress(text: str, amount: int) -> None:

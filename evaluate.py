@@ -41,7 +41,7 @@ import common
 import maml
 import model
 from clip import TextWeightsError, text_features
-from common import UserError, progress_bar, report_progress, run_jobs
+from common import UserError, WorkerPool, progress_bar, report_progress, run_jobs
 from data import RecordingError, WindowSampler, load_demonstrations, positions, write_atomically
 from model import CheckpointError, DAMIPolicy
 from report import (
@@ -59,6 +59,7 @@ from simulator import (
     Simulator,
     check_task,
     collect,
+    environments_of,
     evaluation_seed,
     simulator_of,
 )
@@ -405,9 +406,10 @@ def instruction_features(
 
 # ---- Evaluation in worker processes --------------------------------------------------------------
 
-# What a worker process keeps between its jobs: policy and simulator; of the task that it worked on
-# last the policy, adapted to it where there are inner steps, the sampler and the environments.
-worker_state: dict[str, Any] = {}
+# What a process keeps between its jobs: the policy that it loaded last, and for the task that it
+# worked on last the sampler and the policy, adapted to the task where there are inner steps. Beside
+# each stands what it was made from.
+kept: dict[str, Any] = {"loaded_from": None, "prepared_from": None}
 
 
 def evaluate_checkpoint(
@@ -429,6 +431,7 @@ def evaluate_checkpoint(
     stop_at_success: bool = False,
     config_overrides: dict[str, Any] | None = None,
     description: str = "evaluating",
+    pool: WorkerPool | None = None,
 ) -> Outcomes:
     """Rolls a checkpoint out on tasks of a simulator, in parallel processes.
 
@@ -452,6 +455,7 @@ def evaluate_checkpoint(
         stop_at_success: an episode ends at its first success; it is quicker.
         config_overrides: of the policy's configuration, see `inference_overrides`.
         description: the progress bar's.
+        pool: processes to use, kept from one call to the next; None: `workers` of its own.
 
     Returns:
         The successes, in the order of the episodes. They do not depend on `workers`.
@@ -472,6 +476,10 @@ def evaluate_checkpoint(
         for start in range(0, len(seeds), episodes_a_job):
             jobs.append(
                 {
+                    "checkpoint": checkpoint,
+                    "device": str(device),
+                    "config_overrides": config_overrides or {},
+                    "simulator": simulator,
                     "task": task,
                     "recording": recording,
                     "n_demonstrations": n_demonstrations,
@@ -492,7 +500,7 @@ def evaluate_checkpoint(
         total=sum(len(job["seeds"]) for job in jobs) * simulator.episode_steps,
         description=description,
         unit="step",
-        setup=partial(prepare_worker, checkpoint, simulator, str(device), config_overrides or {}),
+        pool=pool,
     )
 
     any_step: Successes = {task: [] for task in recordings}
@@ -508,15 +516,11 @@ def evaluate_checkpoint(
     return Outcomes(any_step, None if stop_at_success else at_end, other_task or None)
 
 
-def prepare_worker(
-    checkpoint: str | Path, simulator: Simulator, device: str, config_overrides: dict[str, Any]
-) -> None:
-    """Loads the policy in a worker process."""
-    policy, info = load_trained(checkpoint, device, **config_overrides)
-    worker_state.update(policy=policy, info=info, simulator=simulator, task=None)
-
-
 def rollout_job(
+    checkpoint: str | Path,
+    device: str,
+    config_overrides: dict[str, Any],
+    simulator: Simulator,
     task: str,
     recording: Path,
     n_demonstrations: int | None,
@@ -536,10 +540,15 @@ def rollout_job(
     Returns for each episode whether each step was a success, and the same of the pair's other task
     where tasks are pairs, see unnamed_tasks.py; elsewhere no episode.
     """
-    device = worker_state["policy"].normalizer.action_scale.device
+    loaded_from = (checkpoint, device, config_overrides)
+    if kept["loaded_from"] != loaded_from:
+        policy, info = load_trained(checkpoint, device, **config_overrides)
+        kept.update(loaded_from=loaded_from, policy=policy, info=info, prepared_from=None)
+
     feature = torch.from_numpy(text).to(device)  # (text_dim,)
-    if worker_state["task"] != task:
-        policy, info = worker_state["policy"], worker_state["info"]
+    prepared_from = (recording, n_demonstrations, text.tobytes(), inner_steps, inner_lr, support)
+    if kept["prepared_from"] != prepared_from:
+        policy, info = kept["policy"], kept["info"]
         demonstrations = load_demonstrations(recording).take(n_demonstrations)
         sampler = WindowSampler(demonstrations, policy.config, device=device)
         if inner_steps > 0:
@@ -551,15 +560,10 @@ def rollout_job(
                 batch=support or info["arguments"]["support"],
                 lr=inner_rate(info, device, inner_lr),
             )
-        worker_state.update(task=task, task_policy=policy, sampler=sampler, environments=[])
-    policy = worker_state["task_policy"]
-    while len(worker_state["environments"]) < len(seeds):
-        worker_state["environments"].append(
-            worker_state["simulator"].make(task, policy.config.num_points)
-        )
+        kept.update(prepared_from=prepared_from, task_policy=policy, sampler=sampler)
+    policy, sampler = kept["task_policy"], kept["sampler"]
 
-    environments = worker_state["environments"][: len(seeds)]
-    sampler = worker_state["sampler"]
+    environments = environments_of(simulator, task, len(seeds), policy.config.num_points)
     reference = None
     if reference_seed is not None:
         reference = sampler.sample_episode(torch.Generator().manual_seed(reference_seed))
@@ -575,7 +579,7 @@ def rollout_job(
         stop_at_success=stop_at_success,
         on_steps=partial(report_progress, task),
     )
-    skipped = len(seeds) * worker_state["simulator"].episode_steps - sum(map(len, successes))
+    skipped = len(seeds) * simulator.episode_steps - sum(map(len, successes))
     report_progress(task, skipped)  # the steps after a success that ended an episode
     others = [env.other_successes for env in environments if hasattr(env, "other_successes")]
     return successes, others
@@ -1203,25 +1207,26 @@ def measure(
         file.unlink()
 
     outcomes = {}
-    for measurement in choose_measurements(runs, recordings, text, args):
-        outcomes[measurement.label] = evaluate_checkpoint(
-            checkpoint=measurement.checkpoint,
-            simulator=simulator,
-            recordings=measurement.recordings,
-            text=measurement.text,
-            episodes=args.episodes,
-            seed=args.seed,
-            workers=args.workers,
-            device=device,
-            n_demonstrations=args.demonstrations,
-            demonstration_control=measurement.demonstration_control,
-            inner_steps=args.inner_steps,
-            inner_lr=args.inner_lr,
-            support=args.support,
-            known_goals=args.known_goals,
-            stop_at_success=args.stop_at_success,
-            config_overrides=inference_overrides(args),
-        )
+    with WorkerPool(args.workers) as pool:
+        for measurement in choose_measurements(runs, recordings, text, args):
+            outcomes[measurement.label] = evaluate_checkpoint(
+                checkpoint=measurement.checkpoint,
+                simulator=simulator,
+                recordings=measurement.recordings,
+                text=measurement.text,
+                episodes=args.episodes,
+                seed=args.seed,
+                device=device,
+                n_demonstrations=args.demonstrations,
+                demonstration_control=measurement.demonstration_control,
+                inner_steps=args.inner_steps,
+                inner_lr=args.inner_lr,
+                support=args.support,
+                known_goals=args.known_goals,
+                stop_at_success=args.stop_at_success,
+                config_overrides=inference_overrides(args),
+                pool=pool,
+            )
 
     parts = group_tasks(tasks, simulator, suite)
     by_name = args.task or "adapted_to" in info

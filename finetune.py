@@ -33,7 +33,7 @@ import evaluate
 import model
 import report
 from clip import TextWeightsError
-from common import CUDAGraphed, UserError, append_json, setting
+from common import CUDAGraphed, UserError, WorkerPool, append_json, setting
 from data import (
     Demonstrations,
     RecordingError,
@@ -577,22 +577,23 @@ def roll_out_before_and_after(
         columns[f"{step} steps"] = checkpoint_after(folder, step)
     columns["after"] = folder / "adapted.pt"
     kept = len(load_demonstrations(recording).take(settings.demonstrations))
-    return {
-        column: evaluate.evaluate_checkpoint(
-            checkpoint=policy,
-            simulator=simulator,
-            recordings={task: recording},
-            text={task: text},
-            episodes=settings.episodes,
-            seed=settings.seed,
-            workers=workers,
-            device=text.device,
-            n_demonstrations=kept - settings.held_out,
-            config_overrides=config_overrides,
-            description=f"evaluating {column}",
-        )
-        for column, policy in columns.items()
-    }
+    with WorkerPool(workers) as pool:
+        return {
+            column: evaluate.evaluate_checkpoint(
+                checkpoint=policy,
+                simulator=simulator,
+                recordings={task: recording},
+                text={task: text},
+                episodes=settings.episodes,
+                seed=settings.seed,
+                device=text.device,
+                n_demonstrations=kept - settings.held_out,
+                config_overrides=config_overrides,
+                description=f"evaluating {column}",
+                pool=pool,
+            )
+            for column, policy in columns.items()
+        }
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -106,6 +106,7 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         skill, _, _ = split_name(task)
         super().__init__(skill, num_points, episode_steps=episode_steps)
         self.task = task
+        self.skill = skill
         self.goal = goal_of(task)
 
         # Meta-World clips the goal that its expert reads to the goal space, which is narrower than
@@ -115,6 +116,18 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         self.sawyer_env.__dict__.pop("sawyer_observation_space", None)
 
         self.camera = self.make_camera(CAMERA_PIXELS, hidden_sites=("goal",))
+
+    def change_task(self, task: str) -> bool:
+        """Makes this an environment of another goal, if it is one of the same skill.
+
+        Returns whether it is. To make a new environment takes as long as an episode of it.
+        """
+        skill, _, _ = split_name(task)
+        if skill != self.skill:
+            return False
+        self.task = task
+        self.goal = goal_of(task)
+        return True
 
     @cached_property
     def picture_camera(self) -> RayCastCamera:

@@ -65,11 +65,16 @@ class Environment(Protocol):
     def render(self) -> np.ndarray:
         """Returns a picture (240, 240, 3) uint8 of the present moment."""
 
+    # One more may be left out: `change_task(task)` turns this environment into one of another task,
+    # and returns whether it could. A simulator whose tasks are many and alike has it.
+
 
 class Simulator(Protocol):
     """A simulator's tasks, and how to make their environments.
 
-    It is pickled for worker processes: it is small, and its class stands in a module.
+    It is pickled for worker processes: it is small, and its class stands in a module. Two that
+    make the same environments are equal, or environments are made anew for each job of a process:
+    a frozen dataclass does that.
     """
 
     name: str
@@ -154,6 +159,33 @@ def simulator_of(suite: str) -> Simulator:
 def check_task(simulator: Simulator, task: str) -> str:
     """Returns `task` if the simulator has it. Otherwise UserError names the nearest task."""
     return choose(task, simulator.instructions, "task")
+
+
+# The environments of this process, and what they were made for.
+kept_environments: dict[str, Any] = {"environments": [], "made_for": None, "task": None}
+
+
+def environments_of(
+    simulator: Simulator, task: str, number: int, num_points: int
+) -> list[Environment]:
+    """Returns so many environments of a task, whose clouds have `num_points` points.
+
+    Those of the last call are used again, also for another task if they can change to it.
+    """
+    kept = kept_environments
+    made_for = (simulator, num_points)
+    if kept["made_for"] != made_for:
+        kept["environments"] = []
+    elif kept["task"] != task:
+        kept["environments"] = [
+            environment
+            for environment in kept["environments"]
+            if hasattr(environment, "change_task") and environment.change_task(task)
+        ]
+    kept.update(made_for=made_for, task=task)
+    while len(kept["environments"]) < number:
+        kept["environments"].append(simulator.make(task, num_points))
+    return kept["environments"][:number]
 
 
 # ---- Seeds of episodes ---------------------------------------------------------------------------
@@ -341,7 +373,7 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
     """Records `episodes` successful episodes of one task into a file."""
     start = time.perf_counter()
     recipe = simulator.recipe
-    env = simulator.make(task, recipe["num_points"])
+    (env,) = environments_of(simulator, task, 1, recipe["num_points"])
     most_attempts = min(ATTEMPTS_PER_EPISODE * episodes, seeds_of_a_task(simulator))
 
     recorded, episode_seeds, success_frames = [], [], []  # of each successful episode

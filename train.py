@@ -46,6 +46,7 @@ from common import (
     CUDAGraphed,
     StopRequest,
     UserError,
+    WorkerPool,
     append_json,
     choose,
     read_json_lines,
@@ -687,12 +688,13 @@ class Evaluation:
             }
         columns = {}
         try:
-            with stop.suspended():
+            with stop.suspended(), WorkerPool(self.workers) as pool:
+                roll_out = partial(self.roll_out, checkpoint, pool=pool)
                 for title, options in inputs.items():
-                    columns[title] = self.roll_out(checkpoint, **options) if options else own
+                    columns[title] = roll_out(**options) if options else own
                 if settings.pretrain_steps < settings.steps:
                     for title, options in inputs.items():
-                        after = self.roll_out(checkpoint, **options, inner_steps=1)
+                        after = roll_out(**options, inner_steps=1)
                         columns[f"{title}, after an inner step"] = after
                 self.animate(checkpoint)
         except KeyboardInterrupt:

@@ -17,12 +17,12 @@ import common
 import evaluate
 import metaworld_env
 import model
+import simulator
 import train
 from clip import TextWeightsError
 from data import RecordingError
 from model import CheckpointError
 from robot import RobotError
-from simulator import collect
 
 BASE, NOVEL = ["reach", "drawer-close", "window-open"], ["door-close"]
 SMALL_ML10 = {"train": [f"{task}-v3" for task in BASE], "test": [f"{task}-v3" for task in NOVEL]}
@@ -36,7 +36,7 @@ FEW = (
 def recorded(tmp_path_factory):
     """A folder with two expert demonstrations of each task in BASE and NOVEL."""
     folder = tmp_path_factory.mktemp("demonstrations")
-    collect(metaworld_env.MetaWorld(), BASE + NOVEL, folder, episodes=2)
+    simulator.collect(metaworld_env.MetaWorld(), BASE + NOVEL, folder, episodes=2)
     return folder
 
 
@@ -57,6 +57,13 @@ def small_suite():
     """`three_tasks` for one test."""
     with three_tasks():
         yield
+
+
+@pytest.fixture(autouse=True)
+def nothing_kept(monkeypatch):
+    """No test meets a policy or an environment that an earlier one left in this process."""
+    monkeypatch.setattr(evaluate, "kept", dict.fromkeys(evaluate.kept))
+    monkeypatch.setattr(simulator, "kept_environments", dict.fromkeys(simulator.kept_environments))
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from common import command_line, locked, provenance, report_progress, run_jobs
 from data import load_demonstrations
 from evaluate import claim_results
 from report import Outcomes, write_report
-from simulator import Simulator, collect, evaluation_seed, simulator_of
+from simulator import Simulator, collect, environments_of, evaluation_seed, simulator_of
 from tests.runs import SEED
 
 CONTROLS = ("replay", "servo", "expert")
@@ -32,7 +32,7 @@ def control_job(
 ) -> dict[str, list[list[bool]]]:
     """Control -> for each episode whether each of its steps was a success."""
     demonstrations = load_demonstrations(recording)
-    env = simulator.make(task, simulator.recipe["num_points"])
+    (env,) = environments_of(simulator, task, 1, simulator.recipe["num_points"])
     successes: dict[str, list[list[bool]]] = {control: [] for control in CONTROLS}
     for seed in seeds:
         index = np.random.default_rng(seed).integers(len(demonstrations))

@@ -237,17 +237,17 @@ def test_where_a_stop_request_is_suspended_ctrl_c_stops_at_once():
 # ---- Worker processes ----------------------------------------------------------------------------
 
 
-def test_results_come_in_the_order_of_the_jobs_from_processes_that_were_set_up(tmp_path):
-    names = ["c", "a", "b"]
-    found = run_jobs(
-        os.path.abspath,
-        [{"path": name} for name in names],
-        workers=2,
-        total=3,
-        description="naming",
-        setup=functools.partial(os.chdir, tmp_path),
-    )
+def test_results_come_in_the_order_of_the_jobs_and_a_pool_keeps_its_processes(tmp_path):
+    telling = {"workers": 2, "total": 3, "description": "telling"}
+    with common.WorkerPool(2) as pool:
+        (process,) = run_jobs(os.getpid, [{}], pool=pool, **telling)  # one job: one process
+        assert run_jobs(os.getpid, [{}] * 3, pool=pool, **telling) == [process] * 3
+        assert process != os.getpid()
+        run_jobs(os.chdir, [{"path": tmp_path}], pool=pool, **telling)
+        names = ["c", "a", "b"]
+        found = run_jobs(os.path.abspath, [{"path": name} for name in names], pool=pool, **telling)
     assert found == [str(tmp_path / name) for name in names]
+    assert run_jobs(os.getpid, [{}], **telling) != [process]  # one of its own
 
 
 def exit_at_once(code):
@@ -259,24 +259,17 @@ def sleep_or_fail(seconds):
 
 
 @pytest.mark.parametrize(
-    "job, jobs, setup, error, message",
+    "job, jobs, error, message",
     [
-        (exit_at_once, [{"code": 1}], None, UserError, "killed, perhaps for memory"),
-        (sleep_or_fail, [{"seconds": 600}, {"seconds": "long"}], None, ValueError, "long"),
-        (
-            sleep_or_fail,
-            [{"seconds": 0}],
-            functools.partial(os.chdir, "no such folder"),
-            FileNotFoundError,
-            "no such folder",
-        ),
+        (exit_at_once, [{"code": 1}], UserError, "killed, perhaps for memory"),
+        (sleep_or_fail, [{"seconds": 600}, {"seconds": "long"}], ValueError, "long"),
     ],
 )
-def test_a_fault_in_one_process_ends_all(job, jobs, setup, error, message, capfd):
+def test_a_fault_in_one_process_ends_all(job, jobs, error, message, capfd):
     handler = signal.getsignal(signal.SIGINT)
     start = time.monotonic()
     with pytest.raises(error, match=message):
-        run_jobs(job, jobs, workers=2, total=len(jobs), description="failing", setup=setup)
+        run_jobs(job, jobs, workers=2, total=len(jobs), description="failing")
     assert time.monotonic() - start < 500 and not multiprocessing.active_children()
     assert "Traceback" not in capfd.readouterr().err
     assert signal.getsignal(signal.SIGINT) is handler  # Ctrl-C works again

@@ -43,9 +43,8 @@ def features(instructions, weights, identity):
     return 10 * torch.eye(512)[rows], identity or "words"
 
 
-def run_here(job, jobs, *, workers, total, description, unit, setup):
+def run_here(job, jobs, *, workers, total, description, unit, pool):
     """In place of `common.run_jobs`: in this process."""
-    setup()
     return [job(**arguments) for arguments in jobs]
 
 
@@ -55,7 +54,6 @@ def toy(monkeypatch, own_folder):
     monkeypatch.setitem(simulator.SIMULATORS, "toy", ToySimulator)
     monkeypatch.setattr(evaluate, "text_features", features)
     monkeypatch.setattr(evaluate, "run_jobs", run_here)
-    monkeypatch.setattr(evaluate, "worker_state", {})
 
 
 @pytest.fixture(scope="session")
@@ -244,19 +242,30 @@ def test_clouds_with_colors_are_rolled_out_on(recordings):
 
 def test_in_worker_processes_the_episodes_are_the_same(run, recordings, monkeypatch, capsys):
     checkpoint, text = run / "ema-00003.pt", dict(zip(recordings, 10 * torch.eye(512)))
-    monkeypatch.setattr(evaluate, "EPISODES_A_JOB", 4)
+    monkeypatch.setattr(evaluate, "EPISODES_A_JOB", 3)
 
-    def measure(**options):
+    def measure(checkpoint=checkpoint, **options):
         return evaluate.evaluate_checkpoint(
-            checkpoint, ToySimulator(), recordings, text, episodes=10, seed=3, **options
+            checkpoint, ToySimulator(), recordings, text, episodes=5, seed=3, **options
         )
 
     here = measure()
-    assert {len(successes) for successes in here.any_step.values()} == {10}
-    assert {len(successes) for successes in here.at_end.values()} == {10}
-    assert 5 < sum(sum(successes) for successes in here.any_step.values()) < 25  # could differ
+    assert {len(successes) for successes in here.any_step.values()} == {5}
+    assert {len(successes) for successes in here.at_end.values()} == {5}
+    assert 2 < sum(sum(successes) for successes in here.any_step.values()) < 13  # could differ
+    measurements = (  # one after the other in the same processes: nothing is mistaken for another
+        {},
+        {"inner_steps": 1, "inner_lr": 0.1, "support": 4},
+        {"checkpoint": run / "ema-00006.pt"},
+        {"demonstration_control": "zeros"},
+        {"config_overrides": {"inference_steps": 1}},
+        {},
+    )
+    expected = [here, *(measure(**options) for options in measurements[1:])]
     monkeypatch.setattr(evaluate, "run_jobs", common.run_jobs)
-    assert measure(workers=2) == here
+    with common.WorkerPool(2) as pool:
+        assert [measure(**options, pool=pool) for options in measurements] == expected
+    assert len({str(outcomes) for outcomes in expected}) > 3
     assert "evaluating: 100%" in capsys.readouterr().err
 
 
@@ -380,6 +389,10 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
     def job(task, episode):
         frames.clear()
         evaluate.rollout_job(
+            checkpoint=run / "ema-00003.pt",
+            device="cpu",
+            config_overrides={},
+            simulator=Watched(),
             task=task,
             recording=recordings[task],
             n_demonstrations=2,
@@ -393,7 +406,6 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
         )
         return np.stack(frames)
 
-    evaluate.prepare_worker(run / "ema-00003.pt", Watched(), "cpu", {})
     alone = job("touch-red", 1)
     for task, episode in [("touch-red", 0), ("touch-green", 0), ("touch-red", 1)]:
         later = job(task, episode)
@@ -669,10 +681,10 @@ def test_what_the_command_line_says_reaches_the_rollouts(run, recordings, traine
     assert checkpoint == run / "ema-00006.pt" and tasks == ["touch-green"]
     assert torch.equal(text["touch-green"], features(tasks, None, None)[0][0])
     assert isinstance(options.pop("simulator"), ToySimulator)
+    assert options.pop("pool").workers == 2
     assert options == {
         "episodes": 4,
         "seed": 3,
-        "workers": 2,
         "device": torch.device("cpu"),
         "n_demonstrations": 2,
         "demonstration_control": None,

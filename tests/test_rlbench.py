@@ -642,12 +642,10 @@ def test_all_rollouts_of_a_task_hold_one_demonstration_and_are_played_one_at_a_t
     small_suite(monkeypatch, episodes=4)  # of different lengths, by which they are told apart
     policy = Repeats()
     monkeypatch.setattr(evaluate, "load_trained", lambda *_, **__: (policy, {}))
-    monkeypatch.setattr(evaluate, "worker_state", {})
     jobs = []
 
-    def run_here(job, listed, *, setup, **_):
+    def run_here(job, listed, **_):
         jobs.extend(listed)
-        setup()
         return [job(**arguments) for arguments in listed]
 
     monkeypatch.setattr(evaluate, "run_jobs", run_here)

@@ -43,10 +43,8 @@ class ToyMLP(nn.Module):
         return self.layers(flat).view_as(actions)
 
 
-def run_here(job, jobs, *, setup=None, **options):
+def run_here(job, jobs, **options):
     """In place of `common.run_jobs`: a process more would take seconds."""
-    if setup is not None:
-        setup()
     return [job(**arguments) for arguments in jobs]
 
 
@@ -74,7 +72,6 @@ def two_entries(monkeypatch, own_folder):
 def here(monkeypatch):
     """Rollouts are in this process, too."""
     monkeypatch.setattr(evaluate, "run_jobs", run_here)
-    monkeypatch.setattr(evaluate, "worker_state", {})
 
 
 def call(script, options):
