@@ -179,6 +179,7 @@ HIDDEN_GOALS = {
 # What it changes besides in `small`: many goals a step, and few windows of each. Where the hand has
 # to find the puck first, more steps are needed.
 HIDDEN_GOALS_SMALL = {
+    "lr": 5e-4,  # at 1e-3 a training in two stops at a loss where half of the goal is not read
     "tasks_per_step": 40,
     "support": 1,
     "query": 1,

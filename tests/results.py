@@ -239,6 +239,20 @@ def mean(results: Results, variant: str, column: Column) -> str:
     return mean_interval([mean_success(successes) for successes in of_runs])
 
 
+def of_each_run(results: Results, variant: str, column: Column) -> list[float]:
+    """The success of each of a variant's runs that has the column, in percent."""
+    of_runs = [measured(run, column) for run in runs_of(results, variant)]
+    return [mean_success(successes) for successes in of_runs if successes]
+
+
+def mean_and_each(results: Results, variant: str, column: Column) -> str:
+    """The mean over tasks: of several runs with that of each, of one with Wilson's interval."""
+    rates = of_each_run(results, variant, column)
+    if len(rates) < 2:
+        return mean(results, variant, column)
+    return f"{np.mean(rates):.1f} ({', '.join(f'{rate:.0f}' for rate in rates)})"
+
+
 def together(
     results: Results, variant: str, column: Column, tasks: Sequence[str] | None = None
 ) -> list[bool]:
@@ -469,6 +483,11 @@ def looks_table(results: Results) -> str:
 HIDDEN_ROWS = (
     ("with the goal's own demonstration", "demonstration", Column("novel", 0)),
     ("the same, from 20 starts", "demonstration", Column("starts")),
+    (
+        "the same, trained at twice the learning rate",
+        "demonstration-twice-the-rate",
+        Column("novel", 0),
+    ),
     ("with another goal's", "demonstration", Column("novel", 2)),
     ("with zeros in its place", "demonstration", Column("novel", 1)),
     ("with its last frame alone", "demonstration", Column("parts", 1)),
@@ -504,7 +523,9 @@ def hidden_goals_table(results: Results, skill: str) -> str:
     rows = [[f"{skill}, goals never seen", "at any step", "at the end"]]
     for title, variant, column in HIDDEN_ROWS:
         name = f"goals-{skill}-{variant}"
-        cells = [mean(results, name, replace(column, at_end=at_end)) for at_end in (False, True)]
+        cells = [
+            mean_and_each(results, name, replace(column, at_end=at_end)) for at_end in (False, True)
+        ]
         if any(cells):
             rows.append([title, *cells])
     return format_table(rows)
@@ -528,7 +549,7 @@ def hidden_summary_table(results: Results) -> str:
     for title, variant, column in HIDDEN_ROWS:
         if title in HIDDEN_SUMMARY:
             at_end = replace(column, at_end=True)
-            cells = [mean(results, f"goals-{skill}-{variant}", at_end) for skill in skills]
+            cells = [mean_and_each(results, f"goals-{skill}-{variant}", at_end) for skill in skills]
             rows.append([HIDDEN_SUMMARY[title], *cells])
     return format_table(rows)
 
@@ -670,28 +691,27 @@ ARMS = {  # of those without a demonstration encoder -> its line in the figure
 def plot_inner_steps(results: Results, skill: str, path: Path) -> None:
     """Writes a chart of success at the end on novel goals along inner steps, a line an arm.
 
-    A dashed line is the policy that reads a demonstration, without any step.
+    Lines are means of trainings, each of which is a dot. A dashed line is the mean of the policies
+    that read a demonstration, without any step.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.5, 3.6), layout="constrained")
     axes = figure.subplots()
     for place, (arm, label) in enumerate(ARMS.items()):
-        rates, bounds = [], []
-        for n in INNER_STEPS:
+        variant, color = f"goals-{skill}-{arm}", f"C{place}"
+        x, means = np.arange(len(INNER_STEPS)) + 0.05 * (place - 1.5), []  # no dot hides another
+        for i, n in enumerate(INNER_STEPS):
             report = f"{n}-steps-best-rate" if arm.startswith("neither") and n else f"{n}-steps"
-            episodes = together(results, f"goals-{skill}-{arm}", Column(report, at_end=True))
-            rates.append(100 * np.mean(episodes) if episodes else np.nan)
-            interval = wilson_interval(sum(episodes), len(episodes)) if episodes else (0, 0)
-            bounds.append(100 * np.abs(np.array(interval) - rates[-1] / 100))
-        if np.isnan(rates).all():
-            continue
-        x = np.arange(len(INNER_STEPS)) + 0.04 * (place - 1.5)  # so that no line hides another
-        axes.errorbar(x, rates, yerr=np.array(bounds).T, label=label, marker="o", capsize=2)
-    read = together(results, f"goals-{skill}-demonstration", Column("novel", 0, at_end=True))
+            rates = of_each_run(results, variant, Column(report, at_end=True))
+            axes.plot([x[i]] * len(rates), rates, "o", color=color, alpha=0.5)
+            means.append(np.mean(rates) if rates else np.nan)
+        if not np.isnan(means).all():
+            axes.plot(x, means, color=color, label=label)
+    read = of_each_run(results, f"goals-{skill}-demonstration", Column("novel", 0, at_end=True))
     if read:
         label = "reads a demonstration, no step"
-        axes.axhline(100 * np.mean(read), color="gray", linestyle="--", label=label)
+        axes.axhline(np.mean(read), color="gray", linestyle="--", label=label)
     axes.set_xticks(range(len(INNER_STEPS)), [str(n) for n in INNER_STEPS])
     axes.set(xlabel="steps of gradient descent on eight windows of the new goal", ylim=(-3, 103))
     axes.set_ylabel("success at the end, %")
