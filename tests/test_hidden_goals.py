@@ -199,6 +199,17 @@ def test_experts_reach_goals_and_stay_there(environments, skill):
     assert arrays["points"].shape == (100, 64, 3) and arrays["state"].shape == (100, 9)
 
 
+def test_the_expert_of_push_holds_the_puck_firmly(environments):
+    env, _ = environments["push"]
+    env.begin(5)
+    grips = set()
+    for _ in range(60):
+        action = env.expert_action()
+        grips.add(float(action[3]))
+        env.advance(action)
+    assert grips == {0.0, 1.0}  # Meta-World's own has 0.6
+
+
 def test_an_episode_that_does_not_end_in_success_is_not_kept(environments, monkeypatch):
     env, _ = environments["reach"]
     monkeypatch.setattr(env, "episode_steps", 3)
@@ -220,27 +231,15 @@ MARGIN = 2.0  # another goal's demonstration makes the loss so many times as lar
 BASE, NEW = names_of("reach", "goal")[:30], names_of("reach", "validation")[:6]
 
 
-class OneEnvironment(HiddenGoals):
-    """All goals of reach in one environment, which is quicker than one for each."""
-
-    def __init__(self):
-        super().__init__(episode_steps=60)
-        object.__setattr__(self, "env", super().make(BASE[0], hidden_goals.NUM_POINTS))
-
-    def make(self, task, num_points):
-        self.env.task, self.env.goal = task, goal_of(task)
-        return self.env
-
-
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     """Two demonstrations of each goal of BASE and NEW, seen by few rays."""
     folder = tmp_path_factory.mktemp("goals")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hidden_goals, "CAMERA_PIXELS", 24)
-        one = OneEnvironment()
+        short = HiddenGoals(episode_steps=60)
         for task in (*BASE, *NEW):
-            collect_task(one, task, folder / f"{task}.npz", episodes=2, seed=0)
+            collect_task(short, task, folder / f"{task}.npz", episodes=2, seed=0)
     return {task: load_demonstrations(folder / f"{task}.npz") for task in (*BASE, *NEW)}
 
 
