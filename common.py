@@ -22,7 +22,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -386,28 +386,25 @@ class WorkerPool:
             for ...:
                 results = pool.run(job, jobs, bar)
 
-    They are started by the first call, and are no more than its jobs.
-
     Args:
-        workers: processes at most; None: one a core.
+        workers: processes at most; None: one a core. A process starts only when there is a job for
+            it.
 
     Raises UserError if `workers` is below 1.
     """
 
-    def __init__(self, workers: int | None):
+    def __init__(self, workers: int | None = None):
         if workers is not None and workers < 1:
             raise UserError(f"--workers is {workers}: use at least 1")
         self.workers = workers or os.cpu_count() or 1
-        self.executor: ProcessPoolExecutor | None = None  # of the processes, once they are started
-        self.existing_children = set(multiprocessing.active_children())
-        self.working = False  # whether a process has said so
-
-    def start(self, workers: int) -> None:
-        """Starts the processes, or rather has the first job start them."""
         context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
+        self.existing_children = set(multiprocessing.active_children())
+        self.started = False  # whether a process ever was
         with ignored_signals():
             self.progress = context.SimpleQueue()
-            self.executor = ProcessPoolExecutor(workers, context, start_worker, (self.progress,))
+            self.executor = ProcessPoolExecutor(
+                self.workers, context, start_worker, (self.progress,)
+            )
 
     def run(
         self, job: Callable[..., Any], jobs: Sequence[dict[str, Any]], bar: tqdm | None = None
@@ -425,18 +422,16 @@ class WorkerPool:
             UserError: a worker process was killed or could not start.
             Exception: what a job raised. The other jobs are ended by then, and no process is left.
         """
-        if self.executor is None:
-            self.start(min(self.workers, max(1, len(jobs))))
-        with ignored_signals():  # workers inherit that: a terminal sends Ctrl-C to them, too
-            futures = [self.executor.submit(job, **arguments) for arguments in jobs]
         finished = False
         try:
+            with ignored_signals():  # workers inherit that: a terminal sends Ctrl-C to them, too
+                futures = [self.executor.submit(job, **arguments) for arguments in jobs]
             pending = set(futures)
             while pending:
                 done, pending = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED)
                 while not self.progress.empty():
                     text, amount = self.progress.get()
-                    self.working = True
+                    self.started = True
                     if bar is not None:
                         bar.set_postfix_str(text)
                         bar.update(amount)
@@ -445,7 +440,7 @@ class WorkerPool:
             finished = True
             return [future.result() for future in futures]
         except BrokenProcessPool:
-            if self.working:
+            if self.started:
                 problem = "a worker process was killed, perhaps for memory: try fewer --workers"
             else:
                 problem = (
@@ -459,8 +454,6 @@ class WorkerPool:
 
     def end(self, at_once: bool = False) -> None:
         """Ends the processes, after the jobs at hand or `at_once`, and waits for them."""
-        if self.executor is None:
-            return
         with ignored_signals():
             if at_once:
                 for process in set(multiprocessing.active_children()) - self.existing_children:
@@ -478,27 +471,25 @@ def run_jobs(
     job: Callable[..., Any],
     jobs: Sequence[dict[str, Any]],
     *,
-    workers: int | None,
     total: int,
     description: str,
     unit: str = "episode",
+    workers: int | None = None,
     pool: WorkerPool | None = None,
 ) -> list:
     """Calls jobs in the processes of a `WorkerPool`, with a progress bar.
 
     Args:
         job, jobs: see `WorkerPool.run`.
-        workers: see `WorkerPool`; it is not read where there is a `pool`.
         total, description, unit: what the progress bar counts to, its name, what it counts.
+        workers: see `WorkerPool`; ignored if a `pool` is given.
         pool: whose processes work; None: those of a pool that lives as long as the jobs.
 
     Returns and raises what `WorkerPool.run` does.
     """
-    with ExitStack() as stack:
-        if pool is None:
-            pool = stack.enter_context(WorkerPool(workers))
-        bar = stack.enter_context(progress_bar(total=total, desc=description, unit=unit))
-        return pool.run(job, jobs, bar)
+    with nullcontext(pool) if pool else WorkerPool(workers) as pool:
+        with progress_bar(total=total, desc=description, unit=unit) as bar:
+            return pool.run(job, jobs, bar)
 
 
 @contextmanager

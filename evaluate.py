@@ -25,7 +25,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -406,10 +406,46 @@ def instruction_features(
 
 # ---- Evaluation in worker processes --------------------------------------------------------------
 
-# What a process keeps between its jobs: the policy that it loaded last, and for the task that it
-# worked on last the sampler and the policy, adapted to the task where there are inner steps. Beside
-# each stands what it was made from.
-kept: dict[str, Any] = {"loaded_from": None, "prepared_from": None}
+
+@lru_cache(maxsize=1)
+def keep_policy(
+    checkpoint: str | Path, device: str, config_overrides: tuple[tuple[str, Any], ...]
+) -> tuple[DAMIPolicy, dict[str, Any]]:
+    """`load_trained`, whose result a process keeps until it is asked for another policy."""
+    return load_trained(checkpoint, device, **dict(config_overrides))
+
+
+@lru_cache(maxsize=1)
+def keep_adapted(
+    checkpoint: str | Path,
+    device: str,
+    config_overrides: tuple[tuple[str, Any], ...],
+    recording: Path,
+    n_demonstrations: int | None,
+    text: bytes,
+    inner_steps: int,
+    inner_lr: float | None,
+    support: int | None,
+) -> tuple[DAMIPolicy, WindowSampler, Tensor]:
+    """What a process keeps until it works on another task, or on this one in another way.
+
+    That is the policy, adapted to the task where there are inner steps; the windows of its
+    demonstrations; and the instruction feature (text_dim,), whose bytes `text` is.
+    """
+    policy, info = keep_policy(checkpoint, device, config_overrides)
+    demonstrations = load_demonstrations(recording).take(n_demonstrations)
+    sampler = WindowSampler(demonstrations, policy.config, device=device)
+    feature = torch.from_numpy(np.frombuffer(text, np.float32).copy()).to(device)
+    if inner_steps > 0:
+        *_, (_, _, policy) = take_inner_steps(
+            policy,
+            sampler,
+            feature,
+            steps=inner_steps,
+            batch=support or info["arguments"]["support"],
+            lr=inner_rate(info, device, inner_lr),
+        )
+    return policy, sampler, feature
 
 
 def evaluate_checkpoint(
@@ -455,7 +491,8 @@ def evaluate_checkpoint(
         stop_at_success: an episode ends at its first success; it is quicker.
         config_overrides: of the policy's configuration, see `inference_overrides`.
         description: the progress bar's.
-        pool: processes to use, kept from one call to the next; None: `workers` of its own.
+        pool: processes to use, kept from one call to the next; None: `workers` of its own. They
+            keep what they read, so that checkpoints and recordings must not change meanwhile.
 
     Returns:
         The successes, in the order of the episodes. They do not depend on `workers`.
@@ -478,12 +515,12 @@ def evaluate_checkpoint(
                 {
                     "checkpoint": checkpoint,
                     "device": str(device),
-                    "config_overrides": config_overrides or {},
+                    "config_overrides": tuple((config_overrides or {}).items()),
                     "simulator": simulator,
                     "task": task,
                     "recording": recording,
                     "n_demonstrations": n_demonstrations,
-                    "text": text[task].cpu().numpy(),  # tensors would be shared, not copied
+                    "text": text[task].cpu().float().numpy().tobytes(),
                     "seeds": seeds[start : start + episodes_a_job],
                     "demonstration_control": demonstration_control,
                     "inner_steps": inner_steps,
@@ -519,12 +556,12 @@ def evaluate_checkpoint(
 def rollout_job(
     checkpoint: str | Path,
     device: str,
-    config_overrides: dict[str, Any],
+    config_overrides: tuple[tuple[str, Any], ...],
     simulator: Simulator,
     task: str,
     recording: Path,
     n_demonstrations: int | None,
-    text: np.ndarray,
+    text: bytes,
     seeds: list[int],
     demonstration_control: str | None,
     inner_steps: int,
@@ -540,29 +577,17 @@ def rollout_job(
     Returns for each episode whether each step was a success, and the same of the pair's other task
     where tasks are pairs, see unnamed_tasks.py; elsewhere no episode.
     """
-    loaded_from = (checkpoint, device, config_overrides)
-    if kept["loaded_from"] != loaded_from:
-        policy, info = load_trained(checkpoint, device, **config_overrides)
-        kept.update(loaded_from=loaded_from, policy=policy, info=info, prepared_from=None)
-
-    feature = torch.from_numpy(text).to(device)  # (text_dim,)
-    prepared_from = (recording, n_demonstrations, text.tobytes(), inner_steps, inner_lr, support)
-    if kept["prepared_from"] != prepared_from:
-        policy, info = kept["policy"], kept["info"]
-        demonstrations = load_demonstrations(recording).take(n_demonstrations)
-        sampler = WindowSampler(demonstrations, policy.config, device=device)
-        if inner_steps > 0:
-            *_, (_, _, policy) = take_inner_steps(
-                policy,
-                sampler,
-                feature,
-                steps=inner_steps,
-                batch=support or info["arguments"]["support"],
-                lr=inner_rate(info, device, inner_lr),
-            )
-        kept.update(prepared_from=prepared_from, task_policy=policy, sampler=sampler)
-    policy, sampler = kept["task_policy"], kept["sampler"]
-
+    policy, sampler, feature = keep_adapted(
+        checkpoint,
+        device,
+        config_overrides,
+        recording,
+        n_demonstrations,
+        text,
+        inner_steps,
+        inner_lr,
+        support,
+    )
     environments = environments_of(simulator, task, len(seeds), policy.config.num_points)
     reference = None
     if reference_seed is not None:
@@ -1203,11 +1228,10 @@ def measure(
     info = runs[0][-1].info
     old_results = claim_results(out, args.overwrite)
     recordings, text, identity = load_inputs(args, simulator, tasks, info, device)
-    for file in old_results:
-        file.unlink()
-
     outcomes = {}
     with WorkerPool(args.workers) as pool:
+        for file in old_results:
+            file.unlink()
         for measurement in choose_measurements(runs, recordings, text, args):
             outcomes[measurement.label] = evaluate_checkpoint(
                 checkpoint=measurement.checkpoint,

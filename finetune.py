@@ -519,26 +519,13 @@ def adapt_tasks(
     """
     results: dict[str, Outcomes] = {}
     total_seconds = 0.0
-    for task, folder in folders.items():
-        if task in measured:
-            of_task, seconds = measured[task]
-            print(f"{task} was measured before: {folder}", flush=True)
-        else:
-            seconds = adapt_checkpoint(
-                checkpoint,
-                paths[task],
-                text[task],
-                folder,
-                settings,
-                curve=curve,
-                config_overrides=config_overrides,
-            )
-            written = folder / "adapted.pt"
-            print(f"adapted to {task} in {seconds:.1f} s; wrote {written}", flush=True)
-            of_task = {}
-            if simulator is not None and settings.episodes > 0:
-                of_task = roll_out_before_and_after(
-                    task,
+    with WorkerPool(workers) as pool:
+        for task, folder in folders.items():
+            if task in measured:
+                of_task, seconds = measured[task]
+                print(f"{task} was measured before: {folder}", flush=True)
+            else:
+                seconds = adapt_checkpoint(
                     checkpoint,
                     paths[task],
                     text[task],
@@ -546,15 +533,29 @@ def adapt_tasks(
                     settings,
                     curve=curve,
                     config_overrides=config_overrides,
-                    simulator=simulator,
-                    workers=workers,
                 )
-                report.write_report(folder, of_task, {**provenance, "title": task})
-        total_seconds += seconds
-        for column, outcomes in of_task.items():
-            of_column = results.setdefault(column, Outcomes({}, {}))
-            of_column.any_step.update(outcomes.any_step)
-            of_column.at_end.update(outcomes.at_end)
+                written = folder / "adapted.pt"
+                print(f"adapted to {task} in {seconds:.1f} s; wrote {written}", flush=True)
+                of_task = {}
+                if simulator is not None and settings.episodes > 0:
+                    of_task = roll_out_before_and_after(
+                        task,
+                        checkpoint,
+                        paths[task],
+                        text[task],
+                        folder,
+                        settings,
+                        curve=curve,
+                        config_overrides=config_overrides,
+                        simulator=simulator,
+                        pool=pool,
+                    )
+                    report.write_report(folder, of_task, {**provenance, "title": task})
+            total_seconds += seconds
+            for column, outcomes in of_task.items():
+                of_column = results.setdefault(column, Outcomes({}, {}))
+                of_column.any_step.update(outcomes.any_step)
+                of_column.at_end.update(outcomes.at_end)
     return results, total_seconds
 
 
@@ -569,7 +570,7 @@ def roll_out_before_and_after(
     curve: Sequence[int],
     config_overrides: dict[str, Any],
     simulator: Simulator,
-    workers: int | None,
+    pool: WorkerPool,
 ) -> dict[str, Outcomes]:
     """Rolls out a policy and what `adapt_checkpoint` made of it: column -> outcomes."""
     columns = {"before": checkpoint}
@@ -577,23 +578,22 @@ def roll_out_before_and_after(
         columns[f"{step} steps"] = checkpoint_after(folder, step)
     columns["after"] = folder / "adapted.pt"
     kept = len(load_demonstrations(recording).take(settings.demonstrations))
-    with WorkerPool(workers) as pool:
-        return {
-            column: evaluate.evaluate_checkpoint(
-                checkpoint=policy,
-                simulator=simulator,
-                recordings={task: recording},
-                text={task: text},
-                episodes=settings.episodes,
-                seed=settings.seed,
-                device=text.device,
-                n_demonstrations=kept - settings.held_out,
-                config_overrides=config_overrides,
-                description=f"evaluating {column}",
-                pool=pool,
-            )
-            for column, policy in columns.items()
-        }
+    return {
+        column: evaluate.evaluate_checkpoint(
+            checkpoint=policy,
+            simulator=simulator,
+            recordings={task: recording},
+            text={task: text},
+            episodes=settings.episodes,
+            seed=settings.seed,
+            device=text.device,
+            n_demonstrations=kept - settings.held_out,
+            config_overrides=config_overrides,
+            description=f"evaluating {column}",
+            pool=pool,
+        )
+        for column, policy in columns.items()
+    }
 
 
 def main(argv: Sequence[str] | None = None) -> None:

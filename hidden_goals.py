@@ -51,6 +51,14 @@ HAND_LOW, HAND_HIGH = (-0.15, 0.48, 0.12), (0.15, 0.72, 0.32)
 CAMERA_PIXELS = 64
 NUM_POINTS = 64
 
+# How recordings are made; unnamed_tasks.py has the same.
+SMALL_RECIPE = {
+    **RECIPE,
+    "camera": [*RECIPE["camera"][:2], CAMERA_PIXELS],
+    "num_points": NUM_POINTS,
+    "success": "at the end",
+}
+
 # What pictures are drawn from, which show the goal.
 PICTURE_POSITION, PICTURE_LOOKAT = (0.35, 1.6, 0.75), (0.0, 0.66, 0.12)
 
@@ -118,9 +126,9 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         self.camera = self.make_camera(CAMERA_PIXELS, hidden_sites=("goal",))
 
     def change_task(self, task: str) -> bool:
-        """Makes this an environment of another goal, if it is one of the same skill.
+        """Changes to another goal of the same skill, which is quicker than a new environment.
 
-        Returns whether it is. To make a new environment takes as long as an episode of it.
+        Returns False, and changes nothing, if the task is of another skill.
         """
         skill, _, _ = split_name(task)
         if skill != self.skill:
@@ -150,9 +158,9 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
     def expert_action(self) -> np.ndarray:
         """Returns the scripted expert's action (4,) float32 in [-1, 1] for the present moment.
 
-        The one for push drags the puck between its fingers, which it closes at 0.6 of their force.
-        On the long ways to these goals it loses the puck in every fifth episode; at full force in
-        one of twenty.
+        Meta-World's expert for push drags the puck with its fingers closed at 0.6 of full force. On
+        the long ways to these goals it loses the puck in one of five episodes. Here the fingers
+        close at full force, and it loses the puck in one of twenty.
         """
         action = super().expert_action()
         if self.skill == "push" and action[3] > 0:
@@ -183,14 +191,7 @@ class HiddenGoals:
     instructions: ClassVar[dict[str, str]] = {
         task: INSTRUCTIONS[split_name(task)[0]] for task in all_tasks()
     }
-    recipe: ClassVar[dict] = {
-        **RECIPE,
-        "simulator": name,
-        "camera": [*RECIPE["camera"][:2], CAMERA_PIXELS],
-        "num_points": NUM_POINTS,
-        "success": "at the end",
-        "grip": "that of push is of full force",
-    }
+    recipe: ClassVar[dict] = {**SMALL_RECIPE, "simulator": name, "grip": "full force in push"}
     packages: ClassVar[tuple[str, ...]] = ("metaworld", "mujoco")
     demonstrations: ClassVar[int] = 5
 

@@ -65,16 +65,17 @@ class Environment(Protocol):
     def render(self) -> np.ndarray:
         """Returns a picture (240, 240, 3) uint8 of the present moment."""
 
-    # One more may be left out: `change_task(task)` turns this environment into one of another task,
-    # and returns whether it could. A simulator whose tasks are many and alike has it.
+    # One more method is optional. `change_task(task)` turns this environment into one of another
+    # task and returns True, or returns False and changes nothing. It saves time where many tasks
+    # differ little.
 
 
 class Simulator(Protocol):
     """A simulator's tasks, and how to make their environments.
 
-    It is pickled for worker processes: it is small, and its class stands in a module. Two that
-    make the same environments are equal, or environments are made anew for each job of a process:
-    a frozen dataclass does that.
+    It is pickled for worker processes: it is small, and its class stands in a module. Two
+    simulators that make the same environments should compare equal, as frozen dataclasses do;
+    otherwise a process makes its environments anew for each job.
     """
 
     name: str
@@ -168,9 +169,10 @@ kept_environments: dict[str, Any] = {"environments": [], "made_for": None, "task
 def environments_of(
     simulator: Simulator, task: str, number: int, num_points: int
 ) -> list[Environment]:
-    """Returns so many environments of a task, whose clouds have `num_points` points.
+    """Returns `number` environments of a task, whose clouds have `num_points` points.
 
-    Those of the last call are used again, also for another task if they can change to it.
+    The environments of the previous call are used again, also for another task if they can change
+    to it: the caller has to be done with those.
     """
     kept = kept_environments
     made_for = (simulator, num_points)

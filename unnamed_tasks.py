@@ -27,7 +27,7 @@ import numpy as np
 from metaworld import env_dict
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
-from hidden_goals import CAMERA_PIXELS, HAND_HIGH, HAND_LOW, NUM_POINTS, HiddenGoals
+from hidden_goals import CAMERA_PIXELS, HAND_HIGH, HAND_LOW, NUM_POINTS, SMALL_RECIPE, HiddenGoals
 from metaworld_env import INSTRUCTIONS, MetaWorldPointCloudEnv
 
 # ---- Pairs of tasks in one scene -----------------------------------------------------------------
@@ -240,7 +240,7 @@ class Pairs:
         for scene in SCENES
         for direction in DIRECTIONS
     }
-    recipe: ClassVar[dict] = {**HiddenGoals.recipe, "simulator": name}
+    recipe: ClassVar[dict] = {**SMALL_RECIPE, "simulator": name}
     packages: ClassVar[tuple[str, ...]] = HiddenGoals.packages
     demonstrations: ClassVar[int] = 10
 
@@ -266,7 +266,7 @@ class Conventions:
         for angle in angles
     }
     recipe: ClassVar[dict] = {
-        **HiddenGoals.recipe,
+        **SMALL_RECIPE,
         "simulator": name,
         "positions_in_state": 0,  # an action is no displacement in the frame of the clouds
     }

@@ -62,7 +62,8 @@ def small_suite():
 @pytest.fixture(autouse=True)
 def nothing_kept(monkeypatch):
     """No test meets a policy or an environment that an earlier one left in this process."""
-    monkeypatch.setattr(evaluate, "kept", dict.fromkeys(evaluate.kept))
+    evaluate.keep_policy.cache_clear()
+    evaluate.keep_adapted.cache_clear()
     monkeypatch.setattr(simulator, "kept_environments", dict.fromkeys(simulator.kept_environments))
 
 

@@ -246,7 +246,7 @@ def of_each_run(results: Results, variant: str, column: Column) -> list[float]:
 
 
 def mean_and_each(results: Results, variant: str, column: Column) -> str:
-    """The mean over tasks: of several runs with that of each, of one with Wilson's interval."""
+    """The mean over tasks, with each run's own in brackets; of a single run with an interval."""
     rates = of_each_run(results, variant, column)
     if len(rates) < 2:
         return mean(results, variant, column)
@@ -483,16 +483,16 @@ def looks_table(results: Results) -> str:
 HIDDEN_ROWS = (
     ("with the goal's own demonstration", "demonstration", Column("novel", 0)),
     ("the same, from 20 starts", "demonstration", Column("starts")),
-    (
-        "the same, trained at twice the learning rate",
-        "demonstration-twice-the-rate",
-        Column("novel", 0),
-    ),
     ("with another goal's", "demonstration", Column("novel", 2)),
     ("with zeros in its place", "demonstration", Column("novel", 1)),
     ("with its last frame alone", "demonstration", Column("parts", 1)),
     ("without its actions", "demonstration", Column("parts", 2)),
     ("with its frames in another order", "demonstration", Column("parts", 3)),
+    (
+        "with the goal's own, trained at twice the learning rate",
+        "demonstration-twice-the-rate",
+        Column("novel", 0),
+    ),
     ("second order: before any step", "inner", Column("0-steps")),
     ("second order: 1 inner step", "inner", Column("1-steps")),
     ("second order: 1 inner step on another goal", "inner", Column("1-steps-swap", 1)),
@@ -700,7 +700,8 @@ def plot_inner_steps(results: Results, skill: str, path: Path) -> None:
     axes = figure.subplots()
     for place, (arm, label) in enumerate(ARMS.items()):
         variant, color = f"goals-{skill}-{arm}", f"C{place}"
-        x, means = np.arange(len(INNER_STEPS)) + 0.05 * (place - 1.5), []  # no dot hides another
+        x = np.arange(len(INNER_STEPS)) + 0.05 * (place - 1.5)  # so that no arm hides another
+        means = []
         for i, n in enumerate(INNER_STEPS):
             report = f"{n}-steps-best-rate" if arm.startswith("neither") and n else f"{n}-steps"
             rates = of_each_run(results, variant, Column(report, at_end=True))

@@ -238,7 +238,7 @@ def test_where_a_stop_request_is_suspended_ctrl_c_stops_at_once():
 
 
 def test_results_come_in_the_order_of_the_jobs_and_a_pool_keeps_its_processes(tmp_path):
-    telling = {"workers": 2, "total": 3, "description": "telling"}
+    telling = {"total": 3, "description": "telling"}
     with common.WorkerPool(2) as pool:
         (process,) = run_jobs(os.getpid, [{}], pool=pool, **telling)  # one job: one process
         assert run_jobs(os.getpid, [{}] * 3, pool=pool, **telling) == [process] * 3
@@ -247,7 +247,17 @@ def test_results_come_in_the_order_of_the_jobs_and_a_pool_keeps_its_processes(tm
         names = ["c", "a", "b"]
         found = run_jobs(os.path.abspath, [{"path": name} for name in names], pool=pool, **telling)
     assert found == [str(tmp_path / name) for name in names]
-    assert run_jobs(os.getpid, [{}], **telling) != [process]  # one of its own
+    assert run_jobs(os.getpid, [{}], **telling) != [process]  # of a pool of its own
+
+
+def test_a_process_that_is_killed_between_two_calls_is_told_in_one_line():
+    options = {"total": 1, "description": "waiting"}
+    with common.WorkerPool(1) as pool:
+        (process,) = run_jobs(os.getpid, [{}], pool=pool, **options)
+        os.kill(process, signal.SIGKILL)
+        with pytest.raises(UserError, match="killed, perhaps for memory"):
+            while True:  # until the pool has noticed
+                run_jobs(os.getpid, [{}], pool=pool, **options)
 
 
 def exit_at_once(code):

@@ -43,7 +43,7 @@ def features(instructions, weights, identity):
     return 10 * torch.eye(512)[rows], identity or "words"
 
 
-def run_here(job, jobs, *, workers, total, description, unit, pool):
+def run_here(job, jobs, *, total, description, unit, workers, pool):
     """In place of `common.run_jobs`: in this process."""
     return [job(**arguments) for arguments in jobs]
 
@@ -391,12 +391,12 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
         evaluate.rollout_job(
             checkpoint=run / "ema-00003.pt",
             device="cpu",
-            config_overrides={},
+            config_overrides=(),
             simulator=Watched(),
             task=task,
             recording=recordings[task],
             n_demonstrations=2,
-            text=np.zeros(512, np.float32),
+            text=np.zeros(512, np.float32).tobytes(),
             seeds=[simulator.evaluation_seed(0, episode)],
             demonstration_control=None,
             inner_steps=0,

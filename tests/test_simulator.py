@@ -300,3 +300,25 @@ def test_who_interrupts_collecting_is_told_what_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(simulator, "run_jobs", interrupt)
     with pytest.raises(KeyboardInterrupt, match=f"finished are kept in {tmp_path}, the same"):
         collect(ToySimulator(), [TASK], tmp_path)
+
+
+def test_environments_are_used_again_where_they_fit():
+    class Changing(ToySimulator):
+        def make(self, task, num_points):
+            environment = super().make(task, num_points)
+            environment.change_task = lambda task: task != "touch-blue"
+            return environment
+
+    def environments(toy, task, number=1, num_points=64):
+        return simulator.environments_of(toy, task, number, num_points)
+
+    two = environments(ToySimulator(), "touch-red", 2)
+    assert environments(ToySimulator(), "touch-red", 3)[:2] == two  # the same objects
+    assert environments(ToySimulator(), "touch-red") == two[:1]
+    (green,) = environments(ToySimulator(), "touch-green")
+    assert green not in two
+    assert environments(ToySimulator(), "touch-green", num_points=32) != [green]
+
+    (first,) = environments(Changing(), "touch-red")
+    assert environments(Changing(), "touch-green") == [first]
+    assert environments(Changing(), "touch-blue") != [first]
