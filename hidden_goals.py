@@ -158,9 +158,9 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
     def expert_action(self) -> np.ndarray:
         """Returns the scripted expert's action (4,) float32 in [-1, 1] for the present moment.
 
-        Meta-World's expert for push drags the puck with its fingers closed at 0.6 of full force. On
-        the long ways to these goals it loses the puck in one of five episodes. Here the fingers
-        close at full force, and it loses the puck in one of twenty.
+        Meta-World's expert for push drags the puck with its fingers closed at 0.6 of full force,
+        and often loses it on the long ways to these goals: 68 % of its attempts at a demonstration
+        succeeded. Here the fingers close at full force, and 95 % do.
         """
         action = super().expert_action()
         if self.skill == "push" and action[3] > 0:
