@@ -556,25 +556,27 @@ def test_a_late_policy_holds_the_arm_then_stops_it(emulator, settings):
 
 
 def test_a_robot_in_trouble_is_not_moved_at_all(emulator, settings, monkeypatch):
+    def assert_refused(problem):
+        with pytest.raises(RobotError, match=problem):
+            Moving(settings).__enter__()
+        while emulator.owners:  # until it has noticed that the connection ended
+            time.sleep(0.01)
+
     emulator.faults.safety_mode = 3
-    with pytest.raises(RobotError, match="protective stop"):
-        Moving(settings).__enter__()
+    assert_refused("protective stop")
     assert emulator.received == []
     emulator.faults.safety_mode, emulator.faults.no_program = 1, True
     monkeypatch.setattr(Servo, "PATIENCE", 0.3)
-    with pytest.raises(RobotError, match="does not start"):
-        Moving(settings).__enter__()
+    assert_refused("does not start")
     (program,) = emulator.programs
     assert "servoj(get_inverse_kin(pose, get_actual_joint_positions()), t=0.0080, " in program
     emulator.faults.no_program = False
     emulator.pose[0] = 0.25
     time.sleep(0.05)
-    with pytest.raises(RobotError, match=r"outside its box, at 0\.250, -0\.550"):
-        Moving(settings).__enter__()
+    assert_refused(r"outside its box, at 0\.250, -0\.550")
     emulator.pose[0] = float("nan")
     time.sleep(0.05)
-    with pytest.raises(RobotError, match="not finite"):
-        Moving(settings).__enter__()
+    assert_refused("not finite")
 
 
 # ---- Dangers: nothing jumps, nothing stays free, nobody else's program is taken for ours ---------
