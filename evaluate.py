@@ -429,8 +429,11 @@ def keep_adapted(
 ) -> tuple[DAMIPolicy, WindowSampler, Tensor]:
     """What a process keeps until it works on another task, or on this one in another way.
 
-    That is the policy, adapted to the task where there are inner steps; the windows of its
-    demonstrations; and the instruction feature (text_dim,), whose bytes `text` is.
+    The arguments are those of `rollout_job`, all of them hashable.
+
+    Returns:
+        The policy, adapted to the task where there are inner steps; the windows of the task's
+        demonstrations; and the instruction feature, (text_dim,).
     """
     policy, info = keep_policy(checkpoint, device, config_overrides)
     demonstrations = load_demonstrations(recording).take(n_demonstrations)
@@ -515,12 +518,12 @@ def evaluate_checkpoint(
                 {
                     "checkpoint": checkpoint,
                     "device": str(device),
-                    "config_overrides": tuple((config_overrides or {}).items()),
+                    "config_overrides": tuple((config_overrides or {}).items()),  # hashable
                     "simulator": simulator,
                     "task": task,
                     "recording": recording,
                     "n_demonstrations": n_demonstrations,
-                    "text": text[task].cpu().float().numpy().tobytes(),
+                    "text": text[task].cpu().float().numpy().tobytes(),  # hashable
                     "seeds": seeds[start : start + episodes_a_job],
                     "demonstration_control": demonstration_control,
                     "inner_steps": inner_steps,
@@ -572,6 +575,8 @@ def rollout_job(
 ) -> tuple[list[list[bool]], list[list[bool]]]:
     """`rollout` of the episodes of these seeds, of one task, in a worker process.
 
+    The arguments are those of `evaluate_checkpoint`, but for the overrides, which are pairs of name
+    and value, and the instruction feature, whose float32 numbers are the bytes of `text`.
     With a `reference_seed` the demonstration that it draws is held by all rollouts of the task.
 
     Returns for each episode whether each step was a success, and the same of the pair's other task
@@ -1228,6 +1233,7 @@ def measure(
     info = runs[0][-1].info
     old_results = claim_results(out, args.overwrite)
     recordings, text, identity = load_inputs(args, simulator, tasks, info, device)
+
     outcomes = {}
     with WorkerPool(args.workers) as pool:
         for file in old_results:

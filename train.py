@@ -177,7 +177,7 @@ HIDDEN_GOALS = {
     "episodes": 2,
 }
 # What it changes besides in `small`: many goals a step, and few windows of each. At the learning
-# rate of other suites, 1e-3, every second training got stuck at a loss at which the goal is read
+# rate of other suites, 1e-3, one of two trainings got stuck at a loss at which the goal is read
 # only in part. Where the hand has to find the puck first, more steps are needed.
 HIDDEN_GOALS_SMALL = {
     "lr": 5e-4,

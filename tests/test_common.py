@@ -256,7 +256,7 @@ def test_a_process_that_is_killed_between_two_calls_is_told_in_one_line():
         (process,) = run_jobs(os.getpid, [{}], pool=pool, **options)
         os.kill(process, signal.SIGKILL)
         with pytest.raises(UserError, match="killed, perhaps for memory"):
-            while True:  # until the pool has noticed
+            for _ in range(100):  # until the pool has noticed
                 run_jobs(os.getpid, [{}], pool=pool, **options)
 
 

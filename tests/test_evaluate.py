@@ -244,7 +244,7 @@ def test_in_worker_processes_the_episodes_are_the_same(run, recordings, monkeypa
     checkpoint, text = run / "ema-00003.pt", dict(zip(recordings, 10 * torch.eye(512)))
     monkeypatch.setattr(evaluate, "EPISODES_A_JOB", 3)
 
-    def measure(checkpoint=checkpoint, **options):
+    def measure(checkpoint=checkpoint, recordings=recordings, text=text, **options):
         return evaluate.evaluate_checkpoint(
             checkpoint, ToySimulator(), recordings, text, episodes=5, seed=3, **options
         )
@@ -257,6 +257,9 @@ def test_in_worker_processes_the_episodes_are_the_same(run, recordings, monkeypa
         {},
         {"inner_steps": 1, "inner_lr": 0.1, "support": 4},
         {"checkpoint": run / "ema-00006.pt"},
+        {"recordings": evaluate.of_next_task(recordings)},
+        {"text": evaluate.of_next_task(text)},
+        {"n_demonstrations": 1},
         {"demonstration_control": "zeros"},
         {"config_overrides": {"inference_steps": 1}},
         {},

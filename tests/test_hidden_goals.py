@@ -11,6 +11,7 @@ import torch
 import evaluate
 import hidden_goals
 import model
+import simulator
 import train
 from data import WindowSampler, load_demonstrations
 from hidden_goals import SKILLS, HiddenGoalEnv, HiddenGoals, goal_of, names_of, start_of
@@ -238,6 +239,8 @@ def recordings(tmp_path_factory):
     folder = tmp_path_factory.mktemp("goals")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hidden_goals, "CAMERA_PIXELS", 24)
+        nothing = dict.fromkeys(simulator.kept_environments)  # whose cameras have other rays
+        patch.setattr(simulator, "kept_environments", nothing)
         short = HiddenGoals(episode_steps=60)
         for task in (*BASE, *NEW):
             collect_task(short, task, folder / f"{task}.npz", episodes=2, seed=0)

@@ -559,8 +559,10 @@ def test_a_robot_in_trouble_is_not_moved_at_all(emulator, settings, monkeypatch)
     def assert_refused(problem):
         with pytest.raises(RobotError, match=problem):
             Moving(settings).__enter__()
-        while emulator.owners:  # until it has noticed that the connection ended
+        deadline = time.monotonic() + 10
+        while emulator.owners and time.monotonic() < deadline:
             time.sleep(0.01)
+        assert not emulator.owners  # it has noticed that the connection ended
 
     emulator.faults.safety_mode = 3
     assert_refused("protective stop")
