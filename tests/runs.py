@@ -4,6 +4,8 @@
     python -m tests.runs --only dami neither # two at a time, one thread each
     python -m tests.runs                     # all of it
     python -m tests.runs --suite goals-reach --seeds 0 1 2 3 4   # where goals are hidden
+    python -m tests.runs --suite pairs --seeds 0                 # those of unnamed_tasks.py
+    python -m tests.runs --suite convention-reach --seeds 0
 
 A variant is a set of flags of train.py, a run is a variant and a seed. A run is trained, then
 measured: base tasks as they are, novel tasks along their adaptation, and what swapping the
@@ -26,6 +28,7 @@ from pathlib import Path
 from common import choose, command_line
 from tests.oracle import WORLDS
 from train import preset_settings
+from unnamed_tasks import ANGLES, DIRECTIONS, SCENES, turned_task
 
 NEITHER = "--demo-encoder none --maml off"  # multi-task training
 METHOD = {  # a variant of the method -> its flags of train.py
@@ -157,6 +160,46 @@ def hidden_reports() -> dict[str, tuple[str, Sequence[str]]]:
 
 HIDDEN_REPORTS = hidden_reports()
 
+# Where nothing names the task, there are the same arms. All tasks of a pair are trained on, and new
+# are the episodes; turned actions are measured on angles that are new.
+UNNAMED_METHOD = {
+    "demonstration": "--maml off --lr 5e-4 --support 2 --query 6 --steps 3000",
+    "neither": f"{NO_DEMONSTRATION} --maml off --steps 1500",
+    "inner": f"{INNER} --steps 1500",
+}
+
+
+def unnamed_reports(suite: str) -> dict[str, tuple[str, Sequence[str]]]:
+    """The same as REPORTS, for "pairs" and for "convention-SKILL"."""
+    if suite == "pairs":
+        measured = "evaluate.py --checkpoint {run}"
+        # Of two tasks that are named, each is shown the other's demonstration by --swap.
+        shown = {
+            scene: [f"{scene}-{direction}-hidden" for direction in DIRECTIONS] for scene in SCENES
+        }
+    else:
+        measured = "evaluate.py --split novel --checkpoint {run}"
+        # In this order the next task's angle is opposite, or lies 135 degrees away.
+        skill, novel = suite.removeprefix("convention-"), ANGLES["novel"]
+        half = len(novel) // 2
+        angles = [angle for opposites in zip(novel[:half], novel[half:]) for angle in opposites]
+        shown = {"shown": [turned_task(skill, angle) for angle in angles]}
+    reports = {
+        name: (
+            f"evaluate.py --task {' '.join(tasks)} --checkpoint {{run}} --swap demonstration "
+            "--controls zeros no-actions",
+            ("demonstration",),
+        )
+        for name, tasks in shown.items()
+    }
+    for steps in (0, 1, 5):
+        reports[f"{steps}-steps"] = (f"{measured} --inner-steps {steps}", ("inner",))
+    reports["untold"] = (measured, ("neither",))
+    return reports
+
+
+UNNAMED_REPORTS = {suite: unnamed_reports(suite) for suite in ("pairs", "convention-reach")}
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -168,9 +211,11 @@ class Plan:
 
 
 def plan_of(suite: str) -> Plan:
-    """The plan of a suite: that of hidden goals, or that of ML10 and ML45."""
+    """The plan of a suite: that of hidden goals, of tasks without a name, or of ML10 and ML45."""
     if suite.startswith("goals-"):
         return Plan(HIDDEN_METHOD, HIDDEN_REPORTS, episodes=5)
+    if suite in UNNAMED_REPORTS:
+        return Plan(UNNAMED_METHOD, UNNAMED_REPORTS[suite], episodes=20)
     return Plan(VARIANTS, REPORTS, episodes=EPISODES)
 
 
@@ -254,7 +299,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of training")
     parser.add_argument("--suite", default="ml10", help="such as ml10 or goals-reach (ml10)")
     parser.add_argument("--flags", default="", help="more flags of each training")
-    parser.add_argument("--episodes", type=int, help="a task (50; 5 where goals are hidden)")
+    parser.add_argument("--episodes", type=int, help="a task (50, and 5 or 20 in other suites)")
     parser.add_argument("--at-once", type=int, default=2, help="runs at a time")
     parser.add_argument("--list", action="store_true", help="only say what is done")
     args = parser.parse_args(argv)

@@ -24,6 +24,7 @@ import evaluate
 import model
 import report
 import simulator
+import tests.drift
 import tests.unseen
 
 TASKS = ["touch-red", "touch-green"]  # base tasks of the toy; touch-blue is its novel one
@@ -1053,6 +1054,10 @@ def test_a_policy_that_draws_the_experts_actions_has_no_action_error(recordings,
     monkeypatch.setattr(policy, "sample_actions", recall)
     error = evaluate.action_error(policy, sampler, sampler, torch.zeros(512))
     assert error.of_policy.max() < 1e-6 < error.of_mean_action.mean()
+
+    monkeypatch.setattr(tests.drift, "PARTS", ((0, 4), (8, 12)))
+    expert, drawn = zip(*tests.drift.forward_actions(policy, sampler, torch.zeros(512)))
+    assert drawn == pytest.approx(expert, abs=1e-6) and expert[0] > 0.5 > 0.1 > expert[1]
 
 
 def test_checkpoints_are_judged_on_episodes_that_no_training_saw(
