@@ -108,7 +108,7 @@ arrow((11.5, 26), (11.5, 28.5), (59.75, 28.5), (59.75, 26), text="actions (T, A)
 arrow((45, 35), (81.5, 35), (81.5, 26), text="(512)", at=(62, 36.3))
 arrow((45, 22), (53, 22), text="(T, feature)", at=(49, 25))
 arrow((45, 9), (53, 9), text="(To, feature)", at=(49, 12))
-arrow((66.5, 22), (75, 22), text="(T, demo_dim)", at=(70.7, 23.4))
+arrow((66.5, 22), (75, 22), text="(T, D)", at=(70.7, 23.4))
 arrow((66.5, 9), (93, 9), text="(C)", at=(85, 10.4))
 arrow((79, 9), (79, 18))
 arrow((88, 22), (93, 22), text="(C)", at=(90.5, 23.4))
@@ -118,13 +118,13 @@ arrow((100.5, 1.8), (100.5, 5), text="starts from noise; k falls to 0", at=(88.5
 
 letters = (
     "T frames of the demonstration, To = 2 of the observation; N points of P numbers, states of S, "
-    "actions of A;\nH actions are planned, Ta of them executed; C numbers condition the U-Net"
+    "actions of A;\nH actions are planned, Ta of them executed; C numbers condition the U-Net; a token has D"
 )
 axes.text(20, 43.0, letters, fontsize=8, color=INK, va="center")
 
 # Meta-training
 panel(0.5, -37, 65, 36.5, "Meta-training (Algorithm 1)")
-axes.text(2, -5.6, "for every task i of all tasks, in every outer step", fontsize=8, color=INK)
+axes.text(2, -5.6, "for each task i, in every outer step", fontsize=8, color=INK)
 box(2, -17, 13, "Batch", "windows, one\ndemonstration", DATA)
 box(20, -12.5, 13, "Support", "some windows", DATA, 6)
 box(20, -21.5, 13, "Query", "the others", DATA, 6)

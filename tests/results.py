@@ -539,12 +539,15 @@ def hidden_goals_table(results: Results, skill: str) -> str:
 
 HIDDEN_SUMMARY = {  # the most important of these rows -> their titles in README
     "with the goal's own demonstration": "a demonstration of the goal",
+    "the same, from 20 starts": "the same, from 20 starts in place of five",
     "with another goal's": "a demonstration of another goal",
     "with zeros in its place": "zeros in its place",
     "second order: before any step": "no demonstration, second-order MAML: before any step",
     "second order: 1 inner step": "the same, after one inner step",
     "first order: 1 inner step": "first-order MAML, after one inner step",
     "multi-task: 1 step at its best rate": "multi-task training, one step at its best rate",
+    "no network: to the hand's last position": "a script: the hand to where a demonstration ended",
+    "the expert, who knows the goal": "the expert, who knows the goal",
 }
 
 
@@ -736,8 +739,8 @@ def plot_adaptation(results: Results, path: Path) -> None:
 
 INNER_STEPS = (0, 1, 5, 20)
 ARMS = {  # of those without a demonstration encoder -> its line in the figure
-    "inner": "trained through an inner step",
-    "inner-first-order": "the same in first order",
+    "inner": "second-order MAML",
+    "inner-first-order": "first-order MAML",
     "neither": "multi-task, as many outer steps, at its best rates",
     "neither-as-long": "multi-task, as many minutes, at its best rates",
 }
@@ -766,11 +769,11 @@ def plot_inner_steps(results: Results, skill: str, path: Path) -> None:
             axes.plot(x, means, color=color, label=label)
     read = of_each_run(results, f"goals-{skill}-demonstration", Column("novel", 0, at_end=True))
     if read:
-        label = "reads a demonstration, no step"
+        label = "with a demonstration as input, no step"
         axes.axhline(np.mean(read), color="gray", linestyle="--", label=label)
     axes.set_xticks(range(len(INNER_STEPS)), [str(n) for n in INNER_STEPS])
     axes.set(xlabel="steps of gradient descent on eight windows of the new goal", ylim=(-3, 103))
-    axes.set_ylabel("success at the end, %")
+    axes.set_ylabel(f"success at the end, {skill}, %")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="center right")
     save_png(figure, path, dpi=120)
