@@ -118,7 +118,8 @@ arrow((100.5, 1.8), (100.5, 5), text="starts from noise; k falls to 0", at=(88.5
 
 letters = (
     "T frames of the demonstration, To = 2 of the observation; N points of P numbers, states of S, "
-    "actions of A;\nH actions are planned, Ta of them executed; C numbers condition the U-Net; a token has D"
+    "actions of A;\nH actions are planned, Ta of them executed; "
+    "C numbers condition the U-Net; a token has D"
 )
 axes.text(20, 43.0, letters, fontsize=8, color=INK, va="center")
 
