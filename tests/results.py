@@ -41,7 +41,6 @@ from report import (
 )
 from simulator import simulator_of
 from tests.runs import AGAIN, HIDDEN_REPORTS, REPORTS, UNNAMED_REPORTS
-from unnamed_tasks import ANGLES, DIRECTIONS, SCENES, turned_task
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "assets" / "RESULTS.json"
@@ -144,7 +143,6 @@ class Column:
     report: str
     column: int | str = 0
     at_end: bool = False  # success at the end, not at any step
-    other_task: bool = False  # of the pair's other task, at any step
 
 
 BASE, BEFORE, AFTER = Column("base"), Column("novel", "before"), Column("novel", "after")
@@ -210,10 +208,7 @@ def runs_of(results: Results, variant: str) -> list[dict]:
 
 def measured(run: dict, column: Column) -> Successes | None:
     """The episodes in a column of a run's report, if there is one."""
-    if column.other_task:
-        part = "successes at the other task"
-    else:
-        part = "successes at the end" if column.at_end else "successes"
+    part = "successes at the end" if column.at_end else "successes"
     columns = run.get(column.report, {}).get(part, {})
     title = column.column
     if isinstance(title, int):
@@ -563,53 +558,6 @@ def hidden_summary_table(results: Results) -> str:
     return format_table(rows)
 
 
-# The same where nothing names the task. {shown} is the report in which demonstrations are shown.
-UNNAMED_ROWS = (
-    ("with the task's own demonstration", "demonstration", Column("{shown}", 0)),
-    ("with {another} demonstration", "demonstration", Column("{shown}", 3)),
-    ("with zeros in its place", "demonstration", Column("{shown}", 1)),
-    ("with its own, without the actions", "demonstration", Column("{shown}", 2)),
-    ("multi-task training, without demonstration", "neither", Column("untold")),
-    ("second order: before any step", "inner", Column("0-steps")),
-    ("second order: 1 inner step", "inner", Column("1-steps")),
-    ("second order: 5 inner steps", "inner", Column("5-steps")),
-)
-
-
-def pairs_table(results: Results) -> str:
-    """Two tasks in one scene: what was done of each scene's right task, and of its other one."""
-    kinds = {"right": {}, "right, at the end": {"at_end": True}, "other": {"other_task": True}}
-    rows = [["success, percent", *(f"{scene}: {kind}" for scene in SCENES for kind in kinds)]]
-    for title, variant, column in UNNAMED_ROWS:
-        cells = []
-        for scene in SCENES:
-            tasks = [f"{scene}-{direction}-hidden" for direction in DIRECTIONS]
-            report = column.report.format(shown=scene)
-            for fields in kinds.values():
-                measured_by = replace(column, report=report, **fields)
-                cells.append(pooled(results, f"pairs-{variant}", measured_by, tasks))
-        if any(cells):
-            rows.append([title.format(another="the other task's"), *cells])
-    return format_table(rows)
-
-
-def convention_table(results: Results, skill: str) -> str:
-    """Turned actions: success on new angles, on all of them together and at the end of each."""
-    tasks = {angle: turned_task(skill, angle) for angle in ANGLES["novel"]}
-    rows = [["success, percent", "any step", "at the end", *(f"{angle:g}°" for angle in tasks)]]
-    for title, variant, column in UNNAMED_ROWS:
-        name = f"convention-{skill}-{variant}"
-        column = replace(column, report=column.report.format(shown="shown"))
-        at_end = replace(column, at_end=True)
-        cells = [pooled(results, name, kind, list(tasks.values())) for kind in (column, at_end)]
-        for task in tasks.values():
-            episodes = together(results, name, at_end, [task])
-            cells.append(f"{100 * np.mean(episodes):.0f}" if episodes else "")
-        if any(cells):
-            rows.append([title.format(another="an opposite angle's"), *cells])
-    return format_table(rows)
-
-
 TABLES: dict[str, Callable[[Results], str]] = {
     "means": means_table,
     "base": lambda results: by_task_table(results, "base"),
@@ -630,8 +578,6 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
     "goals push": lambda results: hidden_goals_table(results, "push"),
     "goals pick-place": lambda results: hidden_goals_table(results, "pick-place"),
-    "pairs": pairs_table,
-    "convention reach": lambda results: convention_table(results, "reach"),
     "swap": swap_table,
     "reading": reading_table,
 }
