@@ -31,7 +31,6 @@ from report import (
     PAPER_RESULTS,
     Successes,
     format_success,
-    mean_interval,
     mean_success,
     paper_columns,
     plot_success,
@@ -229,28 +228,20 @@ def on_all_goals(run: dict, column: Column) -> Successes | None:
     return {task: first[task] + again[task] for task in first}
 
 
-def mean(results: Results, variant: str, column: Column) -> str:
-    """The mean over tasks: Student's interval over several seeds, Wilson's over one's episodes."""
+def of_each_run(results: Results, variant: str, column: Column) -> list[Successes]:
+    """The episodes of each of a variant's runs that has the column."""
     of_runs = [on_all_goals(run, column) for run in runs_of(results, variant)]
-    of_runs = [successes for successes in of_runs if successes]
+    return [successes for successes in of_runs if successes]
+
+
+def mean(results: Results, variant: str, column: Column) -> str:
+    """The mean over tasks, with each run's own in brackets; of a single run with an interval."""
+    of_runs = of_each_run(results, variant, column)
     if not of_runs:
         return ""
     if len(of_runs) == 1:
         return f"{pooled_success(of_runs[0])} (one run)"
-    return mean_interval([mean_success(successes) for successes in of_runs])
-
-
-def of_each_run(results: Results, variant: str, column: Column) -> list[float]:
-    """The success of each of a variant's runs that has the column, in percent."""
-    of_runs = [measured(run, column) for run in runs_of(results, variant)]
-    return [mean_success(successes) for successes in of_runs if successes]
-
-
-def mean_and_each(results: Results, variant: str, column: Column) -> str:
-    """The mean over tasks, with each run's own in brackets; of a single run with an interval."""
-    rates = of_each_run(results, variant, column)
-    if len(rates) < 2:
-        return mean(results, variant, column)
+    rates = [mean_success(successes) for successes in of_runs]
     return f"{np.mean(rates):.1f} ({', '.join(f'{rate:.0f}' for rate in rates)})"
 
 
@@ -524,9 +515,7 @@ def hidden_goals_table(results: Results, skill: str) -> str:
     rows = [[f"{skill}, goals never seen", "at any step", "at the end"]]
     for title, variant, column in HIDDEN_ROWS:
         name = f"goals-{skill}-{variant}"
-        cells = [
-            mean_and_each(results, name, replace(column, at_end=at_end)) for at_end in (False, True)
-        ]
+        cells = [mean(results, name, replace(column, at_end=at_end)) for at_end in (False, True)]
         if any(cells):
             rows.append([title, *cells])
     return format_table(rows)
@@ -553,7 +542,7 @@ def hidden_summary_table(results: Results) -> str:
     for title, variant, column in HIDDEN_ROWS:
         if title in HIDDEN_SUMMARY:
             at_end = replace(column, at_end=True)
-            cells = [mean_and_each(results, f"goals-{skill}-{variant}", at_end) for skill in skills]
+            cells = [mean(results, f"goals-{skill}-{variant}", at_end) for skill in skills]
             rows.append([HIDDEN_SUMMARY[title], *cells])
     return format_table(rows)
 
@@ -708,15 +697,17 @@ def plot_inner_steps(results: Results, skill: str, path: Path) -> None:
         means = []
         for i, n in enumerate(INNER_STEPS):
             report = f"{n}-steps-best-rate" if arm.startswith("neither") and n else f"{n}-steps"
-            rates = of_each_run(results, variant, Column(report, at_end=True))
+            of_runs = of_each_run(results, variant, Column(report, at_end=True))
+            rates = [mean_success(successes) for successes in of_runs]
             axes.plot([x[i]] * len(rates), rates, "o", color=color, alpha=0.5)
             means.append(np.mean(rates) if rates else np.nan)
         if not np.isnan(means).all():
             axes.plot(x, means, color=color, label=label)
-    read = of_each_run(results, f"goals-{skill}-demonstration", Column("novel", 0, at_end=True))
-    if read:
+    own = Column("novel", 0, at_end=True)
+    if of_runs := of_each_run(results, f"goals-{skill}-demonstration", own):
+        read = np.mean([mean_success(successes) for successes in of_runs])
         label = "with a demonstration as input, no step"
-        axes.axhline(np.mean(read), color="gray", linestyle="--", label=label)
+        axes.axhline(read, color="gray", linestyle="--", label=label)
     axes.set_xticks(range(len(INNER_STEPS)), [str(n) for n in INNER_STEPS])
     axes.set(xlabel="steps of gradient descent on eight windows of the new goal", ylim=(-3, 103))
     axes.set_ylabel(f"success at the end, {skill}, %")
