@@ -15,11 +15,13 @@ checkpoints are of no other one.
 import argparse
 import shlex
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import ClassVar
 
 import numpy as np
+import torch
 from torch.optim.swa_utils import AveragedModel
 
 import common
@@ -115,9 +117,15 @@ def main() -> None:
     args = parser.parse_args()
     WORLDS[args.world]()
 
-    provenance = common.provenance
-    command = shlex.join(["python", "-m", "tests.oracle", *sys.argv[1:]])
-    common.provenance = lambda *arguments: {**provenance(*arguments), "command": command}
+    provenance_of_script = common.provenance
+
+    def provenance(script: str, argv: Sequence[str] | None, device: str | torch.device) -> dict:
+        """The script's, but for the command, which is this one."""
+        found = provenance_of_script(script, argv, device)
+        found["command"] = shlex.join(["python", "-m", "tests.oracle", *sys.argv[1:]])
+        return found
+
+    common.provenance = provenance
     import_module(args.command.removesuffix(".py")).main(args.flags)
 
 

@@ -173,7 +173,8 @@ def take(results: Results, run: Path) -> None:
             "after": round(float(np.mean([line["loss"] for line in inner_steps])), 5),
         }
     results[run.name] = {"training": training}
-    for name in dict.fromkeys(chain(REPORTS, HIDDEN_REPORTS, *UNNAMED_REPORTS.values())):
+    of_plans = (REPORTS, HIDDEN_REPORTS, *UNNAMED_REPORTS.values())
+    for name in dict.fromkeys(chain.from_iterable(of_plans)):  # each name once, in their order
         folder = Path(f"{run}-{name}")
         if (folder / "success.json").exists():
             results[run.name][name] = read_report(folder)
@@ -182,8 +183,13 @@ def take(results: Results, run: Path) -> None:
 def read_report(folder: Path) -> dict[str, Any]:
     """A report as RESULTS.json keeps it, with the episodes as digits."""
     report = json.loads((folder / "success.json").read_text())
-    kinds = ("successes", "successes at the end", "successes at the other task", "checkpoints")
-    for part in kinds:
+    with_episodes = (
+        "successes",
+        "successes at the end",
+        "successes at the other task",
+        "checkpoints",
+    )
+    for part in with_episodes:
         if part in report:
             report[part] = {
                 title: {task: as_digits(episodes) for task, episodes in column.items()}
@@ -228,21 +234,21 @@ def on_all_goals(run: dict, column: Column) -> Successes | None:
     return {task: first[task] + again[task] for task in first}
 
 
-def of_each_run(results: Results, variant: str, column: Column) -> list[Successes]:
-    """The episodes of each of a variant's runs that has the column."""
+def of_each_run(results: Results, variant: str, column: Column) -> list[float]:
+    """The success of each of a variant's runs that has the column, in percent."""
     of_runs = [on_all_goals(run, column) for run in runs_of(results, variant)]
-    return [successes for successes in of_runs if successes]
+    return [mean_success(successes) for successes in of_runs if successes]
 
 
 def mean(results: Results, variant: str, column: Column) -> str:
     """The mean over tasks, with each run's own in brackets; of a single run with an interval."""
-    of_runs = of_each_run(results, variant, column)
-    if not of_runs:
+    rates = of_each_run(results, variant, column)
+    if not rates:
         return ""
-    if len(of_runs) == 1:
-        return f"{pooled_success(of_runs[0])} (one run)"
-    rates = [mean_success(successes) for successes in of_runs]
-    return f"{np.mean(rates):.1f} ({', '.join(f'{rate:.0f}' for rate in rates)})"
+    if len(rates) == 1:
+        return f"{pooled(results, variant, column)} (one run)"
+    each = ", ".join(f"{rate:.0f}" for rate in rates)
+    return f"{np.mean(rates):.1f} ({each})"
 
 
 def together(
@@ -257,8 +263,10 @@ def together(
     return episodes
 
 
-def pooled(results: Results, variant: str, column: Column, tasks: Sequence[str]) -> str:
-    """The share of successes in some tasks, of all of a variant's seeds together."""
+def pooled(
+    results: Results, variant: str, column: Column, tasks: Sequence[str] | None = None
+) -> str:
+    """The share of successes in some tasks, or in all, of all of a variant's seeds together."""
     episodes = together(results, variant, column, tasks)
     return format_success(sum(episodes), len(episodes)) if episodes else ""
 
@@ -697,17 +705,15 @@ def plot_inner_steps(results: Results, skill: str, path: Path) -> None:
         means = []
         for i, n in enumerate(INNER_STEPS):
             report = f"{n}-steps-best-rate" if arm.startswith("neither") and n else f"{n}-steps"
-            of_runs = of_each_run(results, variant, Column(report, at_end=True))
-            rates = [mean_success(successes) for successes in of_runs]
+            rates = of_each_run(results, variant, Column(report, at_end=True))
             axes.plot([x[i]] * len(rates), rates, "o", color=color, alpha=0.5)
             means.append(np.mean(rates) if rates else np.nan)
         if not np.isnan(means).all():
             axes.plot(x, means, color=color, label=label)
-    own = Column("novel", 0, at_end=True)
-    if of_runs := of_each_run(results, f"goals-{skill}-demonstration", own):
-        read = np.mean([mean_success(successes) for successes in of_runs])
+    shown = of_each_run(results, f"goals-{skill}-demonstration", Column("novel", 0, at_end=True))
+    if shown:
         label = "with a demonstration as input, no step"
-        axes.axhline(read, color="gray", linestyle="--", label=label)
+        axes.axhline(np.mean(shown), color="gray", linestyle="--", label=label)
     axes.set_xticks(range(len(INNER_STEPS)), [str(n) for n in INNER_STEPS])
     axes.set(xlabel="steps of gradient descent on eight windows of the new goal", ylim=(-3, 103))
     axes.set_ylabel(f"success at the end, {skill}, %")

@@ -4,8 +4,7 @@
     python -m tests.runs --only dami neither # two at a time, one thread each
     python -m tests.runs                     # all of it
     python -m tests.runs --suite goals-reach --seeds 0 1 2 3 4   # where goals are hidden
-    python -m tests.runs --suite pairs --seeds 0                 # those of unnamed_tasks.py
-    python -m tests.runs --suite convention-reach --seeds 0
+    python -m tests.runs --suite pairs --seeds 0                 # where nothing names the task
 
 A variant is a set of flags of train.py, a run is a variant and a seed. A run is trained, then
 measured: base tasks as they are, novel tasks along their adaptation, and what swapping the
@@ -160,8 +159,8 @@ def hidden_reports() -> dict[str, tuple[str, Sequence[str]]]:
 
 HIDDEN_REPORTS = hidden_reports()
 
-# Where nothing names the task, there are the same arms. All tasks of a pair are trained on, and new
-# are the episodes; turned actions are measured on angles that are new.
+# Where no observation names the task (unnamed_tasks.py), these are the arms. Pairs are measured on
+# the tasks that they were trained on, in new episodes; turned actions on new angles.
 UNNAMED_METHOD = {
     "demonstration": "--maml off --lr 5e-4 --support 2 --query 6 --steps 3000",
     "neither": f"{NO_DEMONSTRATION} --maml off --steps 1500",
@@ -169,36 +168,42 @@ UNNAMED_METHOD = {
 }
 
 
+def angles_apart(skill: str) -> list[str]:
+    """The tasks of the eight new angles, in an order in which the next one is 135 degrees further.
+
+    That holds for the last and the first, too.
+    """
+    angles = ANGLES["novel"]
+    return [turned_task(skill, angles[3 * i % len(angles)]) for i in range(len(angles))]
+
+
 def unnamed_reports(suite: str) -> dict[str, tuple[str, Sequence[str]]]:
-    """The same as REPORTS, for "pairs" and for "convention-SKILL"."""
+    """The same as REPORTS, for "pairs" and for "convention-SKILL".
+
+    `--swap demonstration` shows each task that is named the demonstration of the next one, and the
+    last that of the first. So the tasks are named in groups: the two of a scene, or all angles.
+    """
     if suite == "pairs":
-        measured = "evaluate.py --checkpoint {run}"
-        # Of two tasks that are named, each is shown the other's demonstration by --swap.
-        shown = {
+        evaluation = "evaluate.py --checkpoint {run}"
+        groups = {
             scene: [f"{scene}-{direction}-hidden" for direction in DIRECTIONS] for scene in SCENES
         }
     else:
-        measured = "evaluate.py --split novel --checkpoint {run}"
-        # In this order the next task's angle is opposite, or lies 135 degrees away.
-        skill, novel = suite.removeprefix("convention-"), ANGLES["novel"]
-        half = len(novel) // 2
-        angles = [angle for opposites in zip(novel[:half], novel[half:]) for angle in opposites]
-        shown = {"shown": [turned_task(skill, angle) for angle in angles]}
-    reports = {
-        name: (
-            f"evaluate.py --task {' '.join(tasks)} --checkpoint {{run}} --swap demonstration "
-            "--controls zeros no-actions",
-            ("demonstration",),
-        )
-        for name, tasks in shown.items()
-    }
+        evaluation = "evaluate.py --split novel --checkpoint {run}"
+        groups = {"angles": angles_apart(suite.removeprefix("convention-"))}
+    reports = {}
+    for group, tasks in groups.items():
+        named = f"evaluate.py --task {' '.join(tasks)} --checkpoint {{run}}"
+        swapped = f"{named} --swap demonstration --controls zeros no-actions"
+        reports[group] = (swapped, ("demonstration",))
     for steps in (0, 1, 5):
-        reports[f"{steps}-steps"] = (f"{measured} --inner-steps {steps}", ("inner",))
-    reports["untold"] = (measured, ("neither",))
+        reports[f"{steps}-steps"] = (f"{evaluation} --inner-steps {steps}", ("inner",))
+    reports["multi-task"] = (evaluation, ("neither",))
     return reports
 
 
-UNNAMED_REPORTS = {suite: unnamed_reports(suite) for suite in ("pairs", "convention-reach")}
+UNNAMED_SUITES = ("pairs", "convention-reach", "convention-push")
+UNNAMED_REPORTS = {suite: unnamed_reports(suite) for suite in UNNAMED_SUITES}
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,16 @@ def new_policy(name, preset="tiny", **changes):
 
 def random_batch(policy, windows=6, seed=0, dtype=torch.float32):
     """Random windows, and what the policy draws to make its loss pure."""
-    config, g = policy.config, torch.Generator().manual_seed(seed)
+    config, generator = policy.config, torch.Generator().manual_seed(seed)
     shapes = {"points": (2, config.num_points, 3), "state": (2, 9), "action": (config.horizon, 4)}
-    batch = {k: torch.randn(windows, *shape, generator=g) for k, shape in shapes.items()}
-    batch |= policy.draw_noise_and_timesteps(windows, g)
-    return {k: x.to(dtype) if x.is_floating_point() else x for k, x in batch.items()}
+    batch = {}
+    for name, shape in shapes.items():
+        batch[name] = torch.randn(windows, *shape, generator=generator)
+    batch.update(policy.draw_noise_and_timesteps(windows, generator))
+    for name, x in batch.items():
+        if x.is_floating_point():
+            batch[name] = x.to(dtype)
+    return batch
 
 
 def sample(policy, batch, seed=0):

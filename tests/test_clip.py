@@ -205,10 +205,8 @@ def test_text_features_and_weights_equal_those_of_transformers(weights, tmp_path
         if name == "text_projection":
             state["text_projection.weight"] = value.T
         elif "in_proj_" in name:
-            state |= {
-                name.replace("in_proj_", f"{part}_proj."): value[rows]
-                for part, rows in parts.items()
-            }
+            for part, rows in parts.items():
+                state[name.replace("in_proj_", f"{part}_proj.")] = value[rows]
         else:
             state[name] = value
     missing, unexpected = peer.load_state_dict(state, strict=False)

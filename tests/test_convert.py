@@ -294,8 +294,10 @@ class Bomb:
 def test_nothing_is_unpickled(codec, dtype, capsys):
     buffer("stir.zarr")
     described = Path("stir.zarr/data/state/.zarray")
-    about = json.loads(described.read_text()) | {"compressor": None, "dtype": dtype}
-    described.write_text(json.dumps(about | codec))
+    description = json.loads(described.read_text())
+    description.update(compressor=None, dtype=dtype)
+    description.update(codec)
+    described.write_text(json.dumps(description))
     for chunk in described.parent.glob("[0-9]*"):
         chunk.write_bytes(pickle.dumps(Bomb()))
     assert "stir.zarr" in fails(convert, ["--import", "stir.zarr", *SAY], capsys)
@@ -333,20 +335,26 @@ def dataset(path, version="v3.0", seen="observation.point_cloud", shape=(30, 3),
         features[name] = {"dtype": dtype, "shape": shape, "names": None}
     features[seen]["info"] = info
     features["observation.images.top"] = {"dtype": "video", "shape": [3, 48, 64]}
-    about = {"codebase_version": version, "total_frames": 20, "total_episodes": 3, "fps": 10}
+    information = {
+        "codebase_version": version,
+        "total_frames": 20,
+        "total_episodes": 3,
+        "fps": 10,
+        "features": features,
+    }
     for folder in ("meta/episodes/chunk-000", "data/chunk-000"):
         (path / folder).mkdir(parents=True)
-    (path / "meta/info.json").write_text(json.dumps(about | {"features": features}))
+    (path / "meta/info.json").write_text(json.dumps(information))
 
-    said = ["Stir the soup.", "Pour the tea."]
+    instructions = ["Stir the soup.", "Pour the tea."]
     if version == "v3.0":
-        table = {"task_index": [0, 1], "__index_level_0__": said}
+        table = {"task_index": [0, 1], "__index_level_0__": instructions}
         pyarrow.parquet.write_table(pyarrow.table(table), path / "meta/tasks.parquet")
         table = {"episode_index": [0, 1, 2], "length": LENGTHS}
         write_table(table, path / "meta/episodes/chunk-000/file-000.parquet")
         files = {"file-000": slice(0, 20)}
     else:
-        lines = [json.dumps({"task_index": i, "task": task}) for i, task in enumerate(said)]
+        lines = [json.dumps({"task_index": i, "task": task}) for i, task in enumerate(instructions)]
         (path / "meta/tasks.jsonl").write_text("\n".join(lines))
         files = {f"episode_{e:06d}": episode == e for e in range(3)}
     for name, rows in files.items():

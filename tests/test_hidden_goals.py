@@ -239,8 +239,9 @@ def recordings(tmp_path_factory):
     folder = tmp_path_factory.mktemp("goals")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hidden_goals, "CAMERA_PIXELS", 24)
-        nothing = dict.fromkeys(simulator.kept_environments)  # whose cameras have other rays
-        patch.setattr(simulator, "kept_environments", nothing)
+        # Without those that earlier tests left: their cameras have more rays.
+        none_kept = {"environments": [], "made_for": None, "task": None}
+        patch.setattr(simulator, "kept_environments", none_kept)
         short = HiddenGoals(episode_steps=60)
         for task in (*BASE, *NEW):
             collect_task(short, task, folder / f"{task}.npz", episodes=2, seed=0)

@@ -1,5 +1,6 @@
 """Pairs of tasks that begin alike, and skills whose actions are turned by an unknown angle."""
 
+import re
 from dataclasses import replace
 from itertools import product
 
@@ -12,6 +13,7 @@ import train
 import unnamed_tasks
 from hidden_goals import CAMERA_PIXELS
 from simulator import demonstration_seed, evaluation_seed, record_episode, simulator_of
+from tests.runs import UNNAMED_SUITES, plan_of
 from unnamed_tasks import ANGLES, SCENES, Conventions, Pairs, angle_of, bound_norm, turn
 
 PAIRS, CONVENTIONS = Pairs(), Conventions()
@@ -323,3 +325,27 @@ def test_recordings_keep_what_ends_in_success_and_are_never_augmented(turned):
         assert (settings.evaluate_on, CONVENTIONS.demonstrations) == ("novel", 5)
     settings = replace(train.SETTINGS["small"], **train.SUITE_SETTINGS["pairs"])
     assert (settings.instruction_dropout, settings.evaluate_on) == (0, "base")
+
+
+@pytest.mark.parametrize("suite", UNNAMED_SUITES)
+def test_the_queue_shows_each_task_the_demonstration_of_one_that_contradicts_it(suite):
+    plan = plan_of(suite)
+    for flags in plan.variants.values():
+        train.parse(flags.split())  # exits if one is unknown
+    named = []
+    for command, variants in plan.reports.values():
+        assert set(variants) <= set(plan.variants)
+        if "--swap demonstration" in command:
+            tasks = re.search(r"--task (.*?) --", command)[1].split()
+            shown = evaluate.of_next_task(
+                dict(zip(tasks, tasks))
+            )  # task -> whose demonstration it is shown
+            named += tasks
+            for task, other in shown.items():
+                if suite == "pairs":
+                    assert other == unnamed_tasks.other_of_pair(task)
+                else:
+                    apart = abs(angle_of(task) - angle_of(other))
+                    assert min(apart, 360 - apart) >= 135
+    base, novel = simulator_of(suite).tasks(suite)
+    assert sorted(named) == sorted(base if suite == "pairs" else novel)
