@@ -263,8 +263,9 @@ def read_official(path: Path) -> CLIPTextEncoder:
     return CLIPTextEncoder(weights, f"openai-ViT-B-32-{CLIP_SHA256[:8]}")
 
 
-# Where OpenAI's names and Hugging Face's differ, the longer ones before their beginnings. Queries,
-# keys and values, which stand in one tensor at OpenAI, are put together in `as_openai_names_them`.
+# Where OpenAI's names and Hugging Face's differ. No name is part of another, so that their order
+# does not matter. Queries, keys and values, which stand in one tensor at OpenAI, are put together
+# in `as_openai_names_them`.
 HUGGING_FACE_NAMES = {
     "token_embedding.weight": "text_model.embeddings.token_embedding.weight",
     "positional_embedding": "text_model.embeddings.position_embedding.weight",
@@ -301,9 +302,10 @@ def as_openai_names_them(weights: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def read_clip_file(path: Path) -> CLIPTextEncoder:
-    """The text tower of a file the user gave: OpenAI's own, or a plain state dict, never unpickled.
+    """The text tower of a file the user gave: OpenAI's own, or a plain state dict.
 
-    The state dict has OpenAI's names or Hugging Face's, and can be a .safetensors file.
+    The latter is read without running any code from it. It has OpenAI's names or Hugging Face's,
+    and can be a .safetensors file.
 
     Raises TextWeightsError for a file that is missing, cut off, or neither of the two.
     """
@@ -429,7 +431,7 @@ def load_clip_text_encoder(
 def text_features(
     instructions: Sequence[str], weights: str | None = None, identity: str | None = None
 ) -> tuple[Tensor, str]:
-    """Encodes instructions with the frozen text tower, once.
+    """Encodes instructions with the frozen text tower.
 
     Args:
         instructions: plain sentences, B of them.

@@ -62,7 +62,7 @@ from data import (
     suspicions,
 )
 from report import plot_demonstration
-from robot import depth_to_points
+from robot import depth_to_points, thin
 
 
 def refuse(path: Any, problem: str) -> NoReturn:
@@ -215,7 +215,6 @@ class Source:
 
 LENS = "fx, fy, cx, cy"
 POINT_DIMS = range(3, 11)  # numbers a point may have
-SAMPLED_FROM = 8192  # points at most, since sampling takes time; of more, every k-th
 
 
 def is_cloud_shape(shape: tuple[int, ...]) -> bool:
@@ -259,14 +258,14 @@ def depth_cloud(
     or (M, 6) with colors.
     """
     metres = depth.astype(np.float32) * np.float32(scale)
-    seen = np.isfinite(metres) & (metres > 0)
-    points = depth_to_points(np.where(seen, metres, 0), intrinsics)
+    points = depth_to_points(metres, intrinsics)
     if color is not None:
+        seen = np.isfinite(metres) & (metres > 0)
         points = np.concatenate([points, color[seen].astype(np.float32)], axis=1)
     return points if pose is None else transform(points, pose)
 
 
-def image_size(path: Path, name: str, array: np.ndarray) -> np.ndarray:
+def depth_image(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     """Depth as (H, W), of (H, W), (H, W, 1) or (1, H, W)."""
     if array.ndim == 3 and 1 in (array.shape[0], array.shape[-1]):
         array = array[..., 0] if array.shape[-1] == 1 else array[0]
@@ -288,7 +287,7 @@ def color_image(path: Path, name: str, color: np.ndarray, depth: np.ndarray) -> 
     return color[..., :3]
 
 
-def pixels(path: Path, name: str, intrinsics: np.ndarray) -> list[float]:
+def intrinsics_of(path: Path, name: str, intrinsics: np.ndarray) -> list[float]:
     """fx, fy, cx, cy of four numbers, or of a matrix (3, 3)."""
     if intrinsics.size == 9:
         intrinsics = intrinsics.reshape(3, 3)[[0, 1, 0, 1], [0, 1, 2, 2]]
@@ -339,10 +338,14 @@ def choose_array(
     if chosen is None and len(found) == 1:
         return found[0], found == depths
     there = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-    problem = f"{chosen} is neither" if chosen else "name the array"
-    if chosen in shapes:
-        problem = f"{chosen} is neither (its name does not say depth)"
-    refuse(path, f"{problem}, a cloud (N, 3) or depth (H, W), with --feature; it holds {there}")
+    problem = "name a cloud (N, 3) or depth (H, W) with --feature"
+    if chosen is not None:
+        problem = (
+            f"{chosen} is neither a cloud (N, 3) nor depth (H, W): name another with --feature"
+        )
+    if chosen in shapes and not is_depth(chosen):
+        problem += ", depth by a name that says so"
+    refuse(path, f"{problem}; it holds {there}")
 
 
 # ---- DP3's zarr ----------------------------------------------------------------------------------
@@ -466,8 +469,10 @@ def read_lerobot(path: Path, options: Options) -> Source:
 
 def read_lerobot_info(path: Path) -> dict[str, Any]:
     """meta/info.json; RecordingError where it is of another version, or of another form."""
-    info, file = read_json(path / "meta" / "info.json"), path / "meta" / "info.json"
-    version, features = str(info.get("codebase_version")), info.get("features", {})
+    file = path / "meta" / "info.json"
+    info = read_json(file)
+    version = str(info.get("codebase_version"))
+    features = info.get("features", {})
     if version not in ("v2.0", "v2.1", "v3.0"):
         refuse(path, f"is of LeRobot's format {version}: convert it to v3.0 with lerobot")
     check_features(file, features)
@@ -497,7 +502,7 @@ BOOKKEEPING = ("episode_index", "task_index", "frame_index", "timestamp", "index
 
 
 class LeRobot:
-    """Reads frames of a dataset; which features, is decided when it is made."""
+    """Reads frames of a dataset. Its constructor decides which features are read."""
 
     def __init__(self, path: Path, info: dict[str, Any], options: Options) -> None:
         self.path, self.info, self.camera = path, info, options.camera
@@ -564,7 +569,7 @@ class LeRobot:
         """Metres a unit of the depth that is read.
 
         A video is decoded to metres, by what lerobot took for the unit of the depth it was given.
-        If the camera's unit is said to be another one, all is as many times as far.
+        If --camera names another unit, depth is multiplied by the ratio of that unit to lerobot's.
         """
         stated = (self.features[self.cloud].get("info") or {}).get("depth_unit")
         if not self.is_video(self.cloud):
@@ -697,7 +702,7 @@ class LeRobot:
             depth = decode_image(file, row[self.cloud], None)
         else:
             depth = row[self.cloud]
-        depth = image_size(file, self.cloud, depth)
+        depth = depth_image(file, self.cloud, depth)
         color = None
         if self.color is not None:
             if self.color in self.videos:
@@ -707,7 +712,7 @@ class LeRobot:
             color = color_image(file, self.color, color, depth)
         intrinsics = self.camera.intrinsics
         if intrinsics is None:
-            intrinsics = pixels(file, self.intrinsics, row[self.intrinsics])
+            intrinsics = intrinsics_of(file, self.intrinsics, row[self.intrinsics])
         return depth_cloud(depth, scale=self.scale, intrinsics=intrinsics, color=color)
 
 
@@ -864,9 +869,9 @@ def hdf5_lengths(path: Path, groups: dict[int, Any]) -> dict[int, int]:
     beside = path.with_suffix(".json")
     if not lengths and beside.is_file():
         for row in read_json(beside).get("episodes", []):
-            numbers = row.get("episode_id"), row.get("elapsed_steps")
-            if all(type(number) is int for number in numbers):
-                lengths[numbers[0]] = numbers[1]
+            episode, length = row.get("episode_id"), row.get("elapsed_steps")
+            if type(episode) is int and type(length) is int:
+                lengths[episode] = length
     return lengths
 
 
@@ -879,7 +884,7 @@ def libero_instruction(group: Any) -> str | None:
 
 
 class HDF5:
-    """Reads frames of demonstrations; which arrays, is decided by those of the first one."""
+    """Reads frames of demonstrations. The first of them decides which arrays are read."""
 
     def __init__(self, path: Path, first: dict[str, Any], options: Options) -> None:
         self.path, self.camera = path, options.camera
@@ -887,7 +892,9 @@ class HDF5:
         if self.state is None or not set(self.state) <= set(first):
             refuse(path, f"name the arrays of the state with --state; there are {', '.join(first)}")
 
-        observed = {name: array.shape[1:] for name, array in first.items() if name[:3] == "obs"}
+        observed = {
+            name: array.shape[1:] for name, array in first.items() if name.startswith("obs/")
+        }
         pictures = {n for n in observed if re.search(r"(rgb|image|color)[^/]*$", n)}
         pictures -= {n for n in pictures if re.search(r"(point|cloud|depth)[^/]*$", n)}
         shapes = {name: shape for name, shape in observed.items() if name not in pictures}
@@ -979,7 +986,7 @@ class HDF5:
             refuse_damaged(self.path, error, "no HDF5 file")
         if not self.is_depth:
             return self.colored_cloud(row)
-        depth = image_size(self.path, self.cloud, row[self.cloud])
+        depth = depth_image(self.path, self.cloud, row[self.cloud])
         color = pose = None
         if self.color is not None:
             color = color_image(self.path, self.color, row[self.color], depth)
@@ -987,7 +994,7 @@ class HDF5:
             pose = np.linalg.inv(np.vstack([row[self.extrinsics][:3], [0, 0, 0, 1]]))
         intrinsics = self.camera.intrinsics
         if intrinsics is None:
-            intrinsics = pixels(self.path, self.intrinsics, row[self.intrinsics])
+            intrinsics = intrinsics_of(self.path, self.intrinsics, row[self.intrinsics])
         return depth_cloud(depth, scale=self.scale, intrinsics=intrinsics, color=color, pose=pose)
 
     def colored_cloud(self, row: dict[str, np.ndarray]) -> np.ndarray:
@@ -1164,7 +1171,7 @@ def assemble(
 def read_episodes(
     path: Path, source: Source, options: Options, num_points: int
 ) -> tuple[list[Episode], Counter]:
-    """The episodes of a source that are not left out, and how many frames each of its own has."""
+    """The episodes that --skip does not name, and how many frames each of the source has."""
     episodes: list[Episode] = []
     lengths: Counter = Counter()  # episode -> frames
     previous = None
@@ -1199,7 +1206,8 @@ def choose_instruction(path: Path, frame: Frame, given: str | None) -> str:
 def check_order(path: Path, frame: Frame, previous: Frame | None, fps: float | None) -> None:
     """RecordingError if a frame does not follow the one before it in its episode (None: is first).
 
-    Frames are numbered from 0 without a gap, and times are the rate of the data set apart.
+    Frames are numbered from 0 without a gap, and the times of two in a row are one period of the
+    data set's rate apart.
     """
     skip = f"download it again, or leave the episode out by --skip {frame.episode}"
     expected = 0 if previous is None or previous.index is None else previous.index + 1
@@ -1212,9 +1220,10 @@ def check_order(path: Path, frame: Frame, previous: Frame | None, fps: float | N
     if fps and previous is not None and frame.time is not None and previous.time is not None:
         step = (frame.time - previous.time) * fps
         if not 0.5 < step < 1.5:
+            before = "a frame" if previous.index is None else f"frame {previous.index}"
             refuse(
                 path,
-                f"episode {frame.episode}: {step / fps:.3f} s lie between frame {expected - 1} and "
+                f"episode {frame.episode}: {step / fps:.3f} s lie between {before} and "
                 f"the next, where {fps:g} frames a second are {1 / fps:.3f} s apart: {skip}",
             )
 
@@ -1272,12 +1281,15 @@ def add_frame(
     if len(points) == 0:
         episode.clouds.append(None)
         return
-    points = points[:: math.ceil(len(points) / SAMPLED_FROM), :kept]
-    episode.clouds.append(farthest_point_sample(np.ascontiguousarray(points), num_points))
+    points = np.ascontiguousarray(thin(points)[:, :kept])
+    episode.clouds.append(farthest_point_sample(points, num_points))
 
 
 def fill_empty(path: Path, episode: Episode) -> None:
-    """Frames in which nothing is seen show what was seen before them, if they are few."""
+    """Frames in which nothing is seen show what was seen before them, if they are few.
+
+    At the beginning they show what is seen first.
+    """
     clouds = episode.clouds
     empty = [i for i, cloud in enumerate(clouds) if cloud is None]
     if len(empty) > max(1, len(clouds) // 10) or len(empty) == len(clouds):
@@ -1287,9 +1299,9 @@ def fill_empty(path: Path, episode: Episode) -> None:
             f"first in frame {empty[0]}: look at the unit, at --camera's crop box and pose, or "
             f"leave the episode out by --skip {episode.number}",
         )
-    for i in empty:
-        later = next(cloud for cloud in clouds[i:] + clouds[:i] if cloud is not None)
-        clouds[i] = (clouds[i - 1] if i > 0 else later).copy()
+    first_seen = next(cloud for cloud in clouds if cloud is not None)
+    for i in empty:  # in their order, so that the cloud before is never empty
+        clouds[i] = (clouds[i - 1] if i > 0 else first_seen).copy()
     episode.left_out["empty clouds, in whose place stands the one before"] = len(empty)
 
 

@@ -39,13 +39,12 @@ import numpy as np
 import PIL.Image
 
 from data import RecordingError
-from robot import compose, depth_to_points, difference, nearer, quaternion
+from robot import compose, depth_to_points, difference, nearer, quaternion, thin
 
 CAMERAS = ("front", "left_shoulder", "right_shoulder")
 WRIST = "wrist"  # one camera more, where it is asked for
 WORKSPACE = ((-0.3, -0.5, 0.6), (0.7, 0.5, 1.6))  # the table top and what stands on it
 ROTATION_NEAR = (0.0, 3.14159, 0.0)  # the gripper points down
-SAMPLED_FROM = 8192  # points at most; of more, every k-th is kept, since sampling takes time
 
 # How recordings are made. The suite `fs25` refuses those that were made in another way.
 RECIPE = {
@@ -144,14 +143,14 @@ def read_view(where: Path | str, misc: Mapping[str, Any], camera: str, depth: np
 def seen_points(
     views: Sequence[View], workspace: Sequence[Sequence[float]] = WORKSPACE
 ) -> np.ndarray:
-    """What all cameras see of the workspace, (M, 3) float32 with M of at most SAMPLED_FROM.
+    """What all cameras see of the workspace, (M, 3) float32 with M of at most 8192.
 
     A cloud is made of these by `data.farthest_point_sample`.
     """
     points = np.concatenate([view.points() for view in views])
     low, high = workspace
     points = points[((points >= low) & (points <= high)).all(axis=1)]
-    return points[:: max(1, math.ceil(len(points) / SAMPLED_FROM))]
+    return thin(points)
 
 
 # ---- Pickles, without running any code -----------------------------------------------------------
@@ -331,7 +330,10 @@ def episode_paths(path: Path) -> Iterator[Path]:
 
 
 def variation_folder_of(folder: Path) -> Path:
-    """The folder of the variation that an episode's folder is in, with its name and its task's."""
+    """The folder of an episode's variation, as an absolute path.
+
+    Its name, and that of its parent, the task, are read from it.
+    """
     return Path(os.path.abspath(folder)).parent.parent
 
 
@@ -397,7 +399,7 @@ def read_instruction(episode: EpisodeFolder) -> str | None:
 def read_moments(episode: EpisodeFolder) -> list[Moment]:
     """The T frames of an episode; RecordingError, in one line, if they are not what RLBench writes.
 
-    Only poses are read. Older files, which hold no actions, are therefore as good as newer ones.
+    Actions are made of poses and of the gripper, so that files which hold no actions will do.
     """
     file = episode.folder / "low_dim_obs.pkl"
     demo = read_pickle(file)

@@ -630,7 +630,7 @@ class Bridge:
 class Gripper:
     """An AG95: frames of Modbus RTU over a serial port, 115200 8N1, or a serial bridge on TCP."""
 
-    RETRIES = 3  # of a time-out, a bad check sum, an exception; then RobotError
+    ATTEMPTS = 3  # each may end in a time-out, a bad check sum or an exception; then RobotError
 
     def __init__(self, settings: Settings, host: str, timeout: float = 0.3) -> None:
         self.settings = settings
@@ -657,7 +657,7 @@ class Gripper:
         """
         request = struct.pack(">BBHH", self.settings.gripper_slave, function, register, value)
         request += crc16(request)
-        for _ in range(self.RETRIES):
+        for _ in range(self.ATTEMPTS):
             try:
                 self.port.reset_input_buffer()
                 self.port.write(request)
@@ -678,11 +678,11 @@ class Gripper:
                 problem = "the answer belongs to another request"
             else:
                 return int.from_bytes(answer[3:5] if function == READ else answer[4:6], "big")
-        problem = f"{problem}, {self.RETRIES} times (register {register:#06x})"
+        problem = f"{problem}, {self.ATTEMPTS} times (register {register:#06x})"
         raise RobotError(f"the gripper at {self.where}: {problem}")
 
     def initialize(self, timeout: float = 10.0) -> None:
-        """Initializes the gripper, which opens and closes, if it is not; then sets the force."""
+        """Initializes a gripper that is not, which opens and closes it; then sets the force."""
         if self.exchange(READ, INITIALIZED, 1) != 1:
             self.exchange(WRITE, INITIALIZE, 1)
             deadline = time.monotonic() + timeout
@@ -742,18 +742,22 @@ def to_base(
 SAMPLED_FROM = 8192  # points at most: 10 ms
 
 
+def thin(points: np.ndarray) -> np.ndarray:
+    """At most SAMPLED_FROM of the points (M, P): all, or every second, third ..."""
+    return points[:: max(1, math.ceil(len(points) / SAMPLED_FROM))]
+
+
 def cloud(
     depth: np.ndarray, intrinsics: Sequence[float], settings: Settings
 ) -> tuple[np.ndarray, int]:
     """Depth (H, W), metres -> the policy's points (N, 3) float32, base frame; from how many.
 
-    The points in the crop box are farthest point sampled. Fewer than N are repeated. Of more than
-    SAMPLED_FROM only every second, third ... is kept before: sampling holds Python's lock, so that
-    no other thread runs, and 300 000 points would delay the servo stream by a quarter of a second.
+    The points in the crop box are farthest point sampled. Fewer than N are repeated, and more than
+    SAMPLED_FROM are thinned before: sampling holds Python's lock, so that no other thread runs, and
+    300 000 points would delay the servo stream by a quarter of a second.
     """
     _, points = to_base(depth, intrinsics, settings)
-    thinned = points[:: math.ceil(len(points) / SAMPLED_FROM)]
-    return data.farthest_point_sample(thinned, settings.num_points), len(points)
+    return data.farthest_point_sample(thin(points), settings.num_points), len(points)
 
 
 class RealSense:
@@ -851,10 +855,11 @@ class Activity:
         if current is not None:
             name, began = current
             intervals.append((name, began, now))
-        seconds = {"waiting": 0.0}
+        seconds: dict[str, float] = {}
         for name, began, ended in intervals:
             overlap = min(ended, now) - max(began, since)
             seconds[name] = seconds.get(name, 0.0) + max(0.0, overlap)
+        seconds["waiting"] = now - since - sum(seconds.values())
         return max(seconds.items(), key=lambda item: item[1])
 
 
@@ -873,7 +878,8 @@ def rotate(rotvec: Sequence[float], turn: Sequence[float]) -> np.ndarray:
     """The rotation vector (3,) of one rotation, then a further turn; its angle is at most pi.
 
     In plain numbers, which take a tenth of the time that arrays of three numbers take: the servo's
-    thread does this ten times in 8 ms, and keeps Python's lock from all other threads meanwhile.
+    thread does this up to nine times in 8 ms, and keeps Python's lock from all other threads
+    meanwhile.
     """
     aw, ax, ay, az = quaternion(turn)
     bw, bx, by, bz = quaternion(rotvec)
@@ -955,7 +961,7 @@ class Servo:
     An arm that follows `servoj` is behind by about its lookahead time. So no pose is sent that is
     farther ahead of the measured one than the arm may go in that time: then an arm that was held
     back, and is let go, is not faster than allowed. As the measured pose is old by `DELAY`, targets
-    move a little slower than the arm may.
+    move slower than the arm may: at 80 % of its speed where the lookahead time is 0.1 s.
     """
 
     DELAY = 0.025  # seconds from measuring a pose to following the answer
@@ -1079,11 +1085,11 @@ class Servo:
             self.targets = []
 
     def too_fast(self, actions: np.ndarray) -> int:
-        """How many of the actions (n, 7) are faster than the arm may go: they are cut short."""
+        """How many of the actions (n, 7) are faster than targets may move: they are cut short."""
         return int((lengths(actions) * self.settings.policy_hz > self.speed).any(axis=1).sum())
 
     def go(self, pose: np.ndarray) -> None:
-        """Goes straight to a pose (6,) at a quarter of the speed allowed; returns when there.
+        """Goes straight to a pose (6,), at a quarter of a target's top speed; returns when there.
 
         The line is divided into targets that are 0.1 s apart; `policy_hz` and `max_step_m` are for
         a policy's steps alone. The last target is repeated, until the arm, which lags by servoj's
@@ -1311,8 +1317,9 @@ class Cell:
     def observe(self, servo: Servo | None = None) -> Frame:
         """The present observation.
 
-        While the camera gives none, `servo` holds the arm, which goes nowhere that is not seen, and
-        stops it after `max_hold_s`. Without a servo that is a CameraError at once.
+        If the camera gives none, `servo` holds the arm, and stops it after `max_hold_s`. A
+        RealSense is waited for up to a second before, in which the arm goes on with its chunk.
+        Without a servo that is a CameraError at once.
         """
         while True:
             try:
@@ -1745,7 +1752,7 @@ class Recorder:
         self.count += 1
         print(
             f"episode {self.count}: {len(self.frames)} frames, {servo.too_fast(actions)} of them "
-            f"faster than the arm may go; saved in {self.out}",
+            f"faster than targets may move; saved in {self.out}",
             flush=True,
         )
 
@@ -1805,6 +1812,8 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
 
 def check(args: argparse.Namespace, settings: Settings) -> None:
     """Connects to everything, moves nothing, and says what is there."""
+    if args.picture and not Path(args.picture).parent.is_dir():
+        raise UserError(f"--picture is {args.picture}: its folder does not exist")
     asked = ("robotmode", "safetystatus", "programState", "is in remote control")
     try:
         answers = dashboard(args.host, settings.dashboard_port, *asked)
@@ -1843,8 +1852,9 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
     for name, value in rows.items():
         print(f"{name:22}{value}")
     if args.picture:
-        thinned = points[:: math.ceil(len(points) / SAMPLED_FROM)]
-        frame = Frame(time=0.0, points=thinned, seen=len(kept), state=np.append(state.pose, 0.0))
+        frame = Frame(
+            time=0.0, points=thin(points), seen=len(kept), state=np.append(state.pose, 0.0)
+        )
         plot_cell(args.picture, frame, meta)
         print(f"wrote {args.picture}")
     if trouble:
@@ -1865,6 +1875,9 @@ def plot_cell(path: str, frame: Frame, meta: dict) -> None:
 
 def record_camera(args: argparse.Namespace) -> None:
     """Records depth images to a file that --camera replays."""
+    out = Path(args.out)
+    if out.suffix != ".npz" or not out.parent.is_dir():
+        raise UserError(f"--out is {out}: name an .npz file in a folder that exists")
     camera = RecordedCamera(args.camera) if args.camera else RealSense()
     try:
         depth = np.stack([camera.read() for _ in range(max(1, args.frames))])  # (F, H, W) metres
@@ -1873,9 +1886,9 @@ def record_camera(args: argparse.Namespace) -> None:
     millimetres = (1000 * depth).round().clip(0, 65535).astype(np.uint16)
     intrinsics = np.array(camera.intrinsics)
     data.write_atomically(
-        args.out, lambda path: np.savez_compressed(path, depth=millimetres, intrinsics=intrinsics)
+        out, lambda path: np.savez_compressed(path, depth=millimetres, intrinsics=intrinsics)
     )
-    print(f"wrote {args.out}: {len(depth)} images of {depth.shape[2]} x {depth.shape[1]} pixels")
+    print(f"wrote {out}: {len(depth)} images of {depth.shape[2]} x {depth.shape[1]} pixels")
 
 
 # ---- Command line --------------------------------------------------------------------------------

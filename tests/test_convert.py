@@ -1021,7 +1021,7 @@ def change_hdf5(change):
         ),
         (change_hdf5(lambda f: f.move("data", "other")), SAY, "holds no data/demo_0 or traj_0; it"),
         (lambda: None, [*SAY, "--state", "obs/pose"], "name the arrays of the state with --state"),
-        (lambda: None, [*SAY, "--feature", "obs/depth"], "obs/depth is neither, a cloud (N, 3)"),
+        (lambda: None, [*SAY, "--feature", "obs/depth"], "obs/depth is neither a cloud (N, 3)"),
         (lambda: os.truncate("demo.hdf5", 3000), SAY, "demo.hdf5: is damaged or no HDF5 file"),
         (lambda: sys.modules.__setitem__("h5py", None), SAY, "pip install h5py"),
     ],

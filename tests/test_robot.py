@@ -791,7 +791,7 @@ def test_what_the_main_thread_is_at_counts_too_and_what_is_long_ago_does_not(mon
     now = [0.0]
     monkeypatch.setattr(robot, "time", SimpleNamespace(monotonic=lambda: now[0]))
     activity = robot.Activity()
-    assert activity.longest(0.0, 1.0) == ("waiting", 0.0)
+    assert activity.longest(0.0, 1.0) == ("waiting", 1.0)
     with activity.during("long ago"):
         now[0] = 5.0
     with activity.during("computing actions"):
@@ -1424,6 +1424,9 @@ def test_a_camera_is_recorded_to_a_file_that_is_replayed(cell, capsys):
     begin = first.read()
     for image in (begin, first.read(), first.read(), begin):  # the fourth is the first again
         np.testing.assert_array_equal(again.read(), image)
+    for out in ("again", "none/again.npz"):  # said before anything is recorded
+        assert ends(["camera", "--camera", "scene.npz", "--out", out]) == 2
+        assert "name an .npz file in a folder that exists" in capsys.readouterr().err
 
 
 def test_a_camera_lost_while_recording_ends_it_and_keeps_the_earlier_episodes(
