@@ -118,7 +118,7 @@ class FlowPolicy(DP3Policy):
 
         `noise` (B, H, A) is a0, `times` (B,) float t; of `task` nothing is read.
         """
-        self.encode_demo(**task)
+        self.encode_demo(**task)  # encodes nothing; refuses what is no input of a task
         self.check_shapes(points=points, state=state, action=action, noise=noise, times=times)
 
         clean = self.normalizer.normalize("action", action)  # a1, (B, H, A)
@@ -171,12 +171,12 @@ def associative_scan(a: Tensor, b: Tensor) -> Tensor:
     all places at once, where the recurrence takes L. What came before the first changes nothing.
     """
     reach = 1
-    while True:
+    while reach < b.shape[1]:
         before_a = torch.cat([torch.ones_like(a[:, :reach]), a[:, :-reach]], dim=1)
         before_b = torch.cat([torch.zeros_like(b[:, :reach]), b[:, :-reach]], dim=1)
         a, b = a * before_a, a * before_b + b
-        if (reach := 2 * reach) >= b.shape[1]:
-            return b
+        reach *= 2
+    return b
 
 
 class Mamba(nn.Module):
@@ -336,7 +336,7 @@ class MambaPolicy(DP3Policy):
 
         drop_path (B, branches) float: the factor of each branch; of `task` nothing is read.
         """
-        self.encode_demo(**task)
+        self.encode_demo(**task)  # encodes nothing; refuses what is no input of a task
         self.check_shapes(
             points=points,
             state=state,
@@ -557,7 +557,7 @@ class FreqPolicy(DP3Policy):
         timesteps (B, H) int64: each action has its own; cutoffs (B,) int64; mask (B, H) bool, true
         for hidden places. Of `task` nothing is read.
         """
-        self.encode_demo(**task)
+        self.encode_demo(**task)  # encodes nothing; refuses what is no input of a task
         self.check_shapes(
             points=points,
             state=state,

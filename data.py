@@ -557,12 +557,15 @@ def suspect_shifted_actions(demonstrations: Demonstrations) -> list[str]:
         return []
     curve = curves[:, related].mean(axis=1)  # (lags,)
     best, own = int(curve.argmax()), LAGS.index(0)
-    lag, unexplained = LAGS[best], (1 - curve[own]) / max(1 - curve[best], 1e-9)
-    if curve[best] - curve[own] < 0.005 or unexplained < (2 if lag < 0 else 10):
+    lag = LAGS[best]
+    ratio = (1 - curve[own]) / max(1 - curve[best], 1e-9)  # of what each leaves unexplained
+    if curve[best] - curve[own] < 0.005 or ratio < (2 if lag < 0 else 10):
         return []
+    frames = "1 frame" if abs(lag) == 1 else f"{abs(lag)} frames"
+    when = "earlier" if lag < 0 else "later"
     return [
-        f"actions go best with the change of the state {abs(lag)} "
-        f"{'frame earlier' if lag < 0 else 'frame later'} (correlation {curve[best]:.3f}, with the "
+        f"actions go best with the change of the state {frames} {when} "
+        f"(correlation {curve[best]:.3f}, with the "
         f"change that follows them {curve[own]:.3f}): an action is what is done after its frame"
     ]
 
@@ -591,6 +594,7 @@ def suspect_episode_ends(demonstrations: Demonstrations) -> list[str]:
             inside = 0 <= frame < len(step) and frame not in ends
             if inside and step[frame] > 5 * max(usual, step[end]):
                 found.append((frame, episode, offset))
+                break  # this end is found
     if not found:
         return []
     frame, episode, offset = found[0]

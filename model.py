@@ -122,6 +122,8 @@ class PolicyConfig:
                 f"horizon {H} is no multiple of {2 ** (levels - 1)}: it is halved between the "
                 f"{levels} levels of unet_widths"
             )
+        if self.denoiser == "unet" and self.tcfm == "up" and levels == 1:
+            raise ValueError("tcfm is 'up': of one width in unet_widths no level goes up")
         if self.diffusion_steps % self.inference_steps:
             raise ValueError(
                 f"diffusion_steps {self.diffusion_steps} is no multiple of "
@@ -394,7 +396,8 @@ class ConditionEncoder(nn.Module):
         self.timestep_mlp = nn.Sequential(
             nn.Linear(width, 4 * width), Mish(), nn.Linear(4 * width, width)
         )
-        # Made in any case: the weights that follow then have the same random numbers as DAMI's.
+        # Made in any case, and used where a task is read. Not to make it would change what a seed
+        # draws for the weights that follow, and with them the policies that were published.
         condition_mlp = nn.Sequential(nn.Linear(C, C), Mish(), nn.Linear(C, C))
         self.condition_mlp = condition_mlp if config.reads_task else nn.Identity()
 
@@ -972,7 +975,8 @@ def load(
 
     Raises:
         CheckpointError: the file is missing, damaged, not one of `save` or of an older version of
-            it, lacks one of `needs`, or its weights and its configuration do not fit.
+            it, lacks one of `needs`, its weights and its configuration do not fit, or it cannot be
+            used with `config_overrides`.
     """
     path = Path(path)
     content = read_archive(path, device)
@@ -981,12 +985,17 @@ def load(
     config, weights = content.pop("config"), content.pop("model")
 
     try:
-        config = replace(PolicyConfig(**config), **config_overrides)
+        config = PolicyConfig(**config)
         POLICIES[config.policy].check_config(config)
     except (TypeError, ValueError) as error:  # TypeError: a field of another version
         raise CheckpointError(
             f"{path}: weights and configuration do not fit: {one_line(error)}"
         ) from error
+    try:
+        config = replace(config, **config_overrides)
+        POLICIES[config.policy].check_config(config)
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"{path} cannot be used like this: {one_line(error)}") from error
     with torch.device("meta"):  # takes no memory, for a size that the file may not hold
         empty = build_policy(config)
     expected = {name: tuple(x.shape) for name, x in empty.state_dict().items()}

@@ -5,8 +5,8 @@
 
 The paper's row "Meta-World" is most probably this method, as Meta-World's benchmark has it (Yu et
 al. 2019); the paper does not say. No demonstration, no cloud, no instruction: a small network maps
-a state to a Gaussian of actions, and learns from rewards. The state lacks the goal's coordinates,
-so where goals differ otherwise only by a marker, only the rewards of a few rollouts tell them.
+a state to a Gaussian of actions, and learns from rewards. The state lacks the goal's coordinates.
+In a task such as reach nothing else in it depends on the goal, so that only rewards tell the goal.
 
 In each iteration, for each of some goals (`goal_job`), with L as in `GaussianPolicy.loss`
 
@@ -27,7 +27,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +70,8 @@ class Settings:
 
     The defaults follow Meta-World's benchmark, but for these: an episode is as long as elsewhere in
     this project, goals are drawn anew in each iteration where the benchmark has 50 of each task,
-    and a training is shorter. The width, the damping and the standard deviation, which begins at 1
-    and is the same in all states, are our choice.
+    and a training is shorter. The width and the standard deviation, which begins at 1 and is the
+    same in all states, are our choice.
     """
 
     seed: int = setting(0, "of weights, goals and actions", least=0, most=999)
@@ -119,9 +119,11 @@ class GaussianPolicy(nn.Module):
     def loss(self, params: Params, batch: Batch) -> Tensor:
         """The loss (), whose negative gradient is the policy gradient at these parameters.
 
-        It serves the inner and the outer loop. TRPO's outer loss weighs each action by the ratio of
-        its probabilities under the new and the old policy. A gradient is only taken where the two
-        are the same, and there the gradients of both losses are the same, too.
+        The inner step descends this loss. The outer gradient is taken of it, too, though TRPO's
+        outer loss weighs each advantage by the ratio of the action's probabilities under the new
+        and the old policy. That gradient is only taken where the new policy is the old one, and
+        there the two losses have the same first derivatives. Of the outer loss no second ones are
+        needed.
         """
         mean, log_std = functional_call(self, params, batch["states"])
         return -(log_probability(mean, log_std, batch["actions"]) * batch["advantages"]).mean()
@@ -146,9 +148,9 @@ class Rollouts:
     successes: np.ndarray  # (R, T) bool
 
 
-@cache
+@lru_cache(maxsize=16)  # one takes 0.1 GB, and a suite can have hundreds of tasks
 def environment(simulator: Simulator, task: str) -> Any:
-    """The environment of a task, which is made once in each process."""
+    """The environment of a task. Each process keeps the last ones."""
     env = simulator.make(task, simulator.recipe["num_points"])
     if not hasattr(env, "state_without_goal"):
         raise UserError(f"{simulator.name} has no low-dimensional states: use --suite ml10 or ml45")
@@ -382,7 +384,8 @@ class AdaptedPolicies:
         ratio = torch.exp(log_p - old_log_p)
         loss = -(ratio * self.query["advantages"]).mean()
         kl = torch.distributions.kl_divergence(
-            Normal(old_mean, old_log_std.exp()), Normal(mean, log_std.exp())
+            Normal(old_mean, old_log_std.exp(), validate_args=False),
+            Normal(mean, log_std.exp(), validate_args=False),  # the line search refuses NaN
         )
         return loss.item(), kl.sum(-1).mean().item()
 
@@ -674,6 +677,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         outcomes = measure(
             simulator, [*base_tasks, *novel_tasks], run.policy, settings, args.workers
         )
+        parts = {"mean of base": base_tasks, "mean of novel": novel_tasks}
         table = write_report(
             folder,
             outcomes,
@@ -685,7 +689,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 "seed": settings.seed,
                 **provenance("rl.py", argv, "cpu"),
             },
-            parts={"mean of base": base_tasks, "mean of novel": novel_tasks},
+            parts={name: tasks for name, tasks in parts.items() if tasks},
             paper=paper_columns(args.suite, ["rl"]),
         )
     print(table)
