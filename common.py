@@ -245,7 +245,7 @@ def print_settings(used: dict[str, Any], default: dict[str, Any]) -> None:
     rows = [["setting", "value", "default"]]
     for name, value in used.items():
         usual = default.get(name, value)
-        other = "" if usual is None or usual == value else format_value(usual)
+        other = "" if usual == value else format_value(usual)
         rows.append([name, format_value(value), other])
     print(format_table(rows), flush=True)
 

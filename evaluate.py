@@ -7,8 +7,9 @@
 
 An episode is played to its end, and its success is reported twice: at any step, as the paper and
 DP3 count it, and at the end, as Meta-World's own evaluation does. Each rollout holds one reference
-demonstration, drawn from the task's own. Goals come from seeds that no demonstration uses. Nothing
-is adapted here; finetune.py adapts to novel tasks.
+demonstration, drawn from the task's own. Episodes come from seeds that no demonstration uses,
+unless --known-goals is given. With --inner-steps a policy is adapted to each task as in training;
+Algorithm 2 of the paper is in finetune.py.
 
 One action, from the network to the simulated arm: `rollout` keeps the last To observations of each
 episode, `DAMIPolicy.sample_actions` draws a chunk of actions from them, and the environment's
@@ -363,7 +364,7 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
                 f"taken unasked: train with --preset small, or add --checkpoint {run}"
             )
         raise UserError(f"no finished run on {suite} in {runs}/: train one, or name a --checkpoint")
-    print(f"no finished run in {runs}/: using the policy that comes with the code", flush=True)
+    print(f"no finished run on {suite} in {runs}/: using the policy that comes with the code")
     return shipped
 
 
@@ -416,7 +417,7 @@ def keep_policy(
 
 
 @lru_cache(maxsize=1)
-def keep_adapted(
+def keep_policy_of_task(
     checkpoint: str | Path,
     device: str,
     config_overrides: tuple[tuple[str, Any], ...],
@@ -427,7 +428,7 @@ def keep_adapted(
     inner_lr: float | None,
     support: int | None,
 ) -> tuple[DAMIPolicy, WindowSampler, Tensor]:
-    """What a process keeps until it works on another task, or on this one in another way.
+    """A policy for a task, kept until this process works on another task, or in another way.
 
     The arguments are those of `rollout_job`, all of them hashable.
 
@@ -440,7 +441,7 @@ def keep_adapted(
     sampler = WindowSampler(demonstrations, policy.config, device=device)
     feature = torch.from_numpy(np.frombuffer(text, np.float32).copy()).to(device)
     if inner_steps > 0:
-        *_, (_, _, policy) = take_inner_steps(
+        of_each_step = take_inner_steps(
             policy,
             sampler,
             feature,
@@ -448,6 +449,7 @@ def keep_adapted(
             batch=support or info["arguments"]["support"],
             lr=inner_rate(info, device, inner_lr),
         )
+        _, _, policy = list(of_each_step)[-1]
     return policy, sampler, feature
 
 
@@ -553,7 +555,9 @@ def evaluate_checkpoint(
             at_end[task].append(steps[-1])
         for steps in of_other_task:
             other_task.setdefault(task, []).append(any(steps))
-    return Outcomes(any_step, None if stop_at_success else at_end, other_task or None)
+    if stop_at_success:  # what came after the first success was not played
+        return Outcomes(any_step, at_end=None)
+    return Outcomes(any_step, at_end, other_task or None)
 
 
 def rollout_job(
@@ -582,7 +586,7 @@ def rollout_job(
     Returns for each episode whether each step was a success, and the same of the pair's other task
     where tasks are pairs, see unnamed_tasks.py; elsewhere no episode.
     """
-    policy, sampler, feature = keep_adapted(
+    policy, sampler, feature = keep_policy_of_task(
         checkpoint,
         device,
         config_overrides,
@@ -713,7 +717,7 @@ def evaluate_heldout(
 # ---- Animations ----------------------------------------------------------------------------------
 
 FPS = 30
-FILMS = 3  # below each other
+MAX_FILMS = 3  # in one animation, below each other
 
 
 @dataclass(frozen=True)
@@ -941,7 +945,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--checkpoint", nargs="+", help="files or run folders (default: the newest run's last)")
     add("--suite", help="such as ml10, ml45 (default: the checkpoint's, or ml10)")
     add("--split", choices=("base", "novel", "all"), default="base", help="which of its tasks")
-    add("--task", nargs="+", help="only these tasks, of any suite")
+    add("--task", nargs="+", help="only these tasks, of the suite's simulator")
     add("--data", default="data", help="folder of the demonstrations (default: data)")
     add(
         "--demonstrations",
@@ -952,7 +956,11 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--top", type=int, default=0, help="all checkpoints of a run, and the mean of the best TOP")
     inputs = ("demonstration", "instruction")
     add(
-        "--swap", nargs="+", choices=inputs, default=[], help="measure also with another task's own"
+        "--swap",
+        nargs="+",
+        choices=inputs,
+        default=[],
+        help="measure also with that of another task",
     )
     add("--without", nargs="+", choices=inputs, default=[], help="zeros in the place of these")
     add(
@@ -967,7 +975,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add(
         "--stop-at-success",
         action="store_true",
-        help="end an episode at its first success: quicker, and success at the end is not measured",
+        help="end an episode at its first success: quicker, and nothing after it is measured",
     )
     add("--out", default="runs/evaluation", help="folder of the report (default: runs/evaluation)")
     add("--overwrite", action="store_true", help="replace the report in that folder")
@@ -1004,10 +1012,21 @@ def check_flags(args: argparse.Namespace) -> None:
         raise UserError(f"--inner-lr is {args.inner_lr}: use a number from 0")
     if args.gif:
         movie_writer(args.gif)  # refuses what cannot be written
-        if args.known_goals or "demonstration" in args.without or args.inner_steps:
-            raise UserError(
-                "--gif: leave out --known-goals, --inner-steps, and --without demonstration"
-            )
+        not_shown = {
+            "--known-goals": args.known_goals,
+            "--inner-steps": args.inner_steps,
+            "--swap": args.swap,
+            "--controls": args.controls,
+            "--without demonstration": "demonstration" in args.without,
+        }
+        for flag, given in not_shown.items():
+            if given:
+                raise UserError(f"--gif: leave out {flag}")
+        if len(args.checkpoint or []) > 1:
+            raise UserError("--gif shows rollouts of one policy: name one --checkpoint")
+    for name in args.swap:
+        if name in args.without:
+            raise UserError(f"--swap {name} and --without {name}: leave out one of the two")
     if args.swap and args.top:
         raise UserError("--swap measures the last checkpoint alone: leave out --top")
     if args.swap and args.known_goals:
@@ -1077,7 +1096,7 @@ def check_together(checkpoints: Sequence[Checkpoint], tasks: Sequence[str]) -> N
         if "adapted_to" in info and list(tasks) != [info["adapted_to"]]:
             raise UserError(f"{path} was adapted to {info['adapted_to']}: measure it alone")
         if reads_instruction(info) != reads_instruction(first):
-            raise UserError(f"{path}: with --no-instruction or without, not both at once")
+            raise UserError(f"{path}: measure policies with and without --no-instruction apart")
 
 
 def group_tasks(tasks: Sequence[str], simulator: Simulator, suite: str) -> Parts:
@@ -1231,6 +1250,8 @@ def measure(
     """Rolls out the checkpoints of all runs, and writes and prints the report."""
     out = Path(args.out)
     info = runs[0][-1].info
+    if (out / "adapted.pt").exists():
+        raise UserError(f"{out} holds an adapted policy: choose another --out")
     old_results = claim_results(out, args.overwrite)
     recordings, text, identity = load_inputs(args, simulator, tasks, info, device)
 
@@ -1262,7 +1283,7 @@ def measure(
     by_name = args.task or "adapted_to" in info
     provenance = {
         "title": " ".join(tasks) if by_name else f"{suite}, {args.split} tasks",
-        "episodes a task": args.episodes,
+        "episodes a task": len(next(iter(outcomes.values())).any_step[tasks[0]]),
         "seed": args.seed,
         "goals": "of the demonstrations, each once" if args.known_goals else "new",
         "left out": " and ".join(args.without) or "nothing",
@@ -1275,14 +1296,15 @@ def measure(
         **mean_successes(outcomes, runs, parts, args.top),
     }
     earlier = {checkpoint.label for run in runs for checkpoint in run[:-1]}
+    shown = {label: outcome for label, outcome in outcomes.items() if label not in earlier}
     table = write_report(
         out,
-        {label: outcome for label, outcome in outcomes.items() if label not in earlier},
+        shown,
         provenance,
         parts=parts,
         paper=paper_columns(suite, dict.fromkeys(run[-1].policy for run in runs)),
         checkpoints=outcomes if args.top else None,
-        pooled=info["arguments"].get("evaluate_on") == "novel" and len(outcomes) > 1,
+        pooled=info["arguments"].get("evaluate_on") == "novel" and len(shown) > 1,
     )
     print(f"\n{table}\n")
     for name, value in provenance.items():
@@ -1310,9 +1332,10 @@ def main(argv: list[str] | None = None) -> None:
         raise UserError("--swap takes from another task of a split: leave out --task")
 
     if args.gif:
-        if len(tasks) > FILMS:
+        if len(tasks) > MAX_FILMS:
             raise UserError(
-                f"--gif draws at most {FILMS} rollouts: name their tasks, --task reach --gif x.gif"
+                f"--gif draws at most {MAX_FILMS} rollouts: "
+                "name their tasks, --task reach --gif x.gif"
             )
         watch(
             args,

@@ -6,9 +6,9 @@
     python finetune.py --task shelf-place --inner-steps 5    # as meta-training adapts, see below
 
 The EMA policy of meta-training is trained on with AdamW, each step on windows of the task's
-demonstrations and one of them as reference; its three parts have learning rates of their own, and
-there is neither warm-up nor decay. What is kept is an EMA again. A task of a simulator is rolled
-out before and after: the difference is what adaptation bought.
+demonstrations and one of them as reference; its three parts have learning rates of their own, which
+stay constant. What is kept is an EMA again. A task of a simulator is rolled out before and after:
+the difference is what adaptation bought.
 
 With `--inner-steps`, the adaptation is the one that meta-training differentiates (Eq. 2): so many
 steps of plain gradient descent on one batch of windows, with the inner learning rates of training,
@@ -43,7 +43,7 @@ from data import (
     suspicions,
     write_text,
 )
-from model import CheckpointError, DAMIPolicy, ema_model
+from model import CheckpointError, DAMIPolicy, PolicyConfig, ema_model
 from report import Outcomes
 from simulator import (
     SIMULATORS,
@@ -62,7 +62,11 @@ BATCH = {"paper": 108, "small": 64, "tiny": 16}  # windows a step, by preset
 
 @dataclass(frozen=True)
 class Settings:
-    """What an adaptation is made of; each field is a flag. None is filled in later."""
+    """What an adaptation is made of; each field is a flag.
+
+    A default of None stands for one that depends on the policy or the task, see `resolve` and
+    `main`.
+    """
 
     steps: int = setting(200, "gradient steps (default: 200)", least=1)
     batch: int | None = setting(None, f"windows a step{common.describe_presets(BATCH)}", least=1)
@@ -79,7 +83,9 @@ class Settings:
     normalizer: str = setting(
         "fit", "fit it to the task's data, or keep that of training", choices=("fit", "keep")
     )
-    demonstrations: int | None = setting(None, "how many (default: 10; of a file all)", least=1)
+    demonstrations: int | None = setting(
+        None, "how many (default: 10 or 5, as the suite says; of a file all)", least=1
+    )
     held_out: int = setting(
         0, "of them, the last so many are only for measuring (default: 0)", least=0
     )
@@ -351,15 +357,19 @@ def describe_adaptation(
     }
 
 
-def read_instructions(paths: dict[str, Path], settings: Settings) -> dict[str, str]:
+def read_instructions(
+    paths: dict[str, Path], settings: Settings, config: PolicyConfig
+) -> dict[str, str]:
     """Task -> instruction, of recordings (task -> file).
 
-    Raises RecordingError for a recording of fewer demonstrations than the settings ask for.
+    Raises RecordingError for a recording of fewer demonstrations than the settings ask for, or one
+    that does not fit a policy of this configuration.
     """
     instructions = {}
     for task, path in paths.items():
         demonstrations = load_demonstrations(path).take(settings.demonstrations)
         hold_out(demonstrations, settings.held_out)  # only to check that there are enough
+        WindowSampler(demonstrations, config)  # only to check that they fit
         instructions[task] = demonstrations.instruction
     return instructions
 
@@ -577,7 +587,7 @@ def roll_out_before_and_after(
     for step in sorted(set(curve)):
         columns[f"{step} steps"] = checkpoint_after(folder, step)
     columns["after"] = folder / "adapted.pt"
-    kept = len(load_demonstrations(recording).take(settings.demonstrations))
+    taken = len(load_demonstrations(recording).take(settings.demonstrations))
     return {
         column: evaluate.evaluate_checkpoint(
             checkpoint=policy,
@@ -587,7 +597,7 @@ def roll_out_before_and_after(
             episodes=settings.episodes,
             seed=settings.seed,
             device=text.device,
-            n_demonstrations=kept - settings.held_out,
+            n_demonstrations=taken - settings.held_out,
             config_overrides=config_overrides,
             description=f"evaluating {column}",
             pool=pool,
@@ -659,7 +669,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         if recording is None:
             n = settings.demonstrations
             collect(simulator, tasks, args.data, episodes=n, workers=args.workers)
-        instructions = read_instructions(paths, settings)
+        instructions = read_instructions(paths, settings, policy.config)
         text, text_weights = evaluate.instruction_features(
             instructions,
             weights=args.clip_weights,
@@ -670,7 +680,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         for old_file in old_files:  # nothing more can be refused
             old_file.unlink()
 
-        common.print_settings(used=asdict(settings), default=asdict(Settings()))
+        usual = {name: x for name, x in asdict(Settings()).items() if x is not None}
+        common.print_settings(used=asdict(settings), default=usual)
         provenance = {
             "title": f"{name}: before and after {settings.steps} steps",
             "checkpoint": str(checkpoint),

@@ -92,8 +92,9 @@ def meta_gradient(
         loss_fn, params, lr, steps, first_order: as in `adapt`.
         tasks: (support, query) batches, one pair a task. An iterator is read `vectorize` tasks at a
             time, and their graph is freed before the next are read: memory does not grow.
-        vectorize: how many tasks run at once, under `torch.vmap`. The numbers are the same, and it
-            is up to twice as fast. The batches must have equal shapes and hold tensors only.
+        vectorize: how many tasks run at once, under `torch.vmap`. The numbers are the same up
+            to rounding, and it is up to twice as fast. The batches must have equal shapes and hold
+            tensors only.
 
     Returns:
         gradients: name -> tensor.

@@ -92,7 +92,7 @@ def paper_columns(suite: str, policies: Iterable[str]) -> PaperColumns:
     """What the paper reports of some policies on the tasks of a suite.
 
     Args:
-        suite: "ml10" or "ml45"; the paper has nothing of any other.
+        suite: "ml10" or "ml45"; of others the paper says nothing about single tasks.
         policies: keys of PAPER_NAMES; others, which the paper does not have, are skipped.
 
     Returns:
@@ -156,7 +156,7 @@ def with_any_of(tasks: Sequence[str], paper: PaperColumns) -> PaperColumns:
 def heldout_table(columns: dict[str, dict[str, float]]) -> str:
     """A Markdown table of action errors on held-out episodes: a row for each task, and the mean.
 
-    `columns` are title -> task -> error, see `evaluate.evaluate_heldout`.
+    `columns` are title -> task -> error, the mean over the numbers of an action.
     """
     tasks = list(next(iter(columns.values())))  # all columns have the same
     rows = [["held-out action error", *columns]]
@@ -202,7 +202,8 @@ def write_report(
             the end if they were measured, and one of those at the other task if tasks are pairs.
         parts, paper: see `success_table`.
         provenance: how the results were measured, name -> value; "title" is the chart's.
-        checkpoints: label -> results of other checkpoints; they go only into success.json.
+        checkpoints: label -> results, those of other checkpoints among them. They are written into
+            success.json, and stand in no table.
         pooled: table and chart put the episodes of all tasks together: a row for each label.
     """
     kinds = {"any step": {}, "at the end": {}, "the other task": {}}  # -> label -> successes

@@ -65,9 +65,10 @@ class Environment(Protocol):
     def render(self) -> np.ndarray:
         """Returns a picture (240, 240, 3) uint8 of the present moment."""
 
-    # One more method is optional. `change_task(task)` turns this environment into one of another
+    # Two more members are optional. `change_task(task)` turns this environment into one of another
     # task and returns True, or returns False and changes nothing. It saves time where many tasks
-    # differ little.
+    # differ little. `other_successes`, where tasks are pairs, lists for each step of the episode
+    # whether it was a success at the pair's other task.
 
 
 class Simulator(Protocol):
@@ -98,7 +99,7 @@ class Simulator(Protocol):
 
 
 def import_simulator(module: str) -> ModuleType:
-    """Imports a file that needs Meta-World; UserError says what to install where it is missing."""
+    """Imports a simulator's file; UserError says what to install where a package is missing."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
@@ -214,7 +215,7 @@ def episode_seed(seed: int, episode: int) -> int:
 def evaluation_seed(seed: int, episode: int) -> int:
     """Returns the episode seed of a rollout, at least 10**8.
 
-    Those of demonstrations are below, so that no rollout has the goal of a demonstration.
+    Those of demonstrations are below, so that no rollout is the episode of a demonstration.
     """
     return RUN_SEEDS * EPISODE_SEEDS + episode_seed(seed, episode)
 
@@ -425,15 +426,19 @@ def record_episode(
     """Lets the expert act for one episode.
 
     Returns its "points" (T, N, P) float16, "state" (T, S) and "action" (T, A) float32, each of the
-    moment before the step, and the frame of its first success; None if it had none, or with
-    `at_end` if its last step was none.
+    moment before the step, and the frame of its first success; None if it had none, if there was a
+    moment in which nothing was seen, or with `at_end` if its last step was no success.
     """
     points, state, actions = [], [], []  # of each frame
     success_frame = None
     env.begin(seed)
     truncated = False
     while not truncated:
-        observation, action = env.observe(), env.expert_action()
+        try:
+            observation = env.observe()
+        except OutOfSightError:
+            return None
+        action = env.expert_action()
         points.append(observation["point_cloud"].astype(np.float16))
         state.append(observation["agent_pos"].astype(np.float32))
         actions.append(action.astype(np.float32))

@@ -63,7 +63,7 @@ def small_suite():
 def nothing_kept(monkeypatch):
     """No test meets a policy or an environment that an earlier one left in this process."""
     evaluate.keep_policy.cache_clear()
-    evaluate.keep_adapted.cache_clear()
+    evaluate.keep_policy_of_task.cache_clear()
     monkeypatch.setattr(simulator, "kept_environments", dict.fromkeys(simulator.kept_environments))
 
 

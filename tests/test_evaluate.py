@@ -863,6 +863,8 @@ def test_an_adapted_policy_is_watched_from_its_folder(
     assert seen == ["touch-blue"] and "is novel" not in capsys.readouterr().out
     message = fails(evaluate, command("all", recordings, "--gif x.gif"), capsys)
     assert "holds no checkpoint: name all/touch-blue" in message
+    message = fails(evaluate, command(run, recordings, "--out all/touch-blue --overwrite"), capsys)
+    assert "holds an adapted policy" in message and Path("all/touch-blue/adapted.pt").exists()
     evaluate.main(command(run, recordings, "--gif x.gif --task touch-blue"))
     assert "touch-blue is novel to this policy: `python finetune.py" in capsys.readouterr().out
 
@@ -905,6 +907,10 @@ def test_a_movie_is_written_by_what_is_there(monkeypatch):
         ("--gif x.gif --split all --task touch-red touch-green touch-blue touch-red", "at most 3"),
         ("--gif x.gif --task touch-red --known-goals", "leave out --known-goals"),
         ("--gif x.gif --task touch-red --without demonstration", "--without demonstration"),
+        ("--gif x.gif --task touch-red touch-blue --swap demonstration", "leave out --swap"),
+        ("--swap demonstration --without demonstration", "leave out one of the two"),
+        ("--gif x.gif --task touch-red --controls zeros", "leave out --controls"),
+        ("--swap demonstration --without demonstration", "leave out one of the two"),
         ("--gif x.avi --task touch-red", "name it .gif or .mp4"),
         ("--gif none/x.gif --task touch-red", "there is no such folder"),
         ("--out runs/toy-tiny-seed0", "holds a training run: choose another --out"),
@@ -929,7 +935,12 @@ def test_a_mistake_ends_in_one_line_that_says_what_to_do(
             "was adapted to touch-blue, not to touch-red",
         ),
         ({"adapted_to": "touch-blue"}, ["run"], "", "was adapted to touch-blue: measure it alone"),
-        ({"adaptation": {"instruction": False}}, ["run"], "", "not both at once"),
+        (
+            {"adaptation": {"instruction": False}},
+            ["run"],
+            "",
+            "measure policies with and without --no-instruction apart",
+        ),
         ({"text_weights": "others"}, ["run"], "", "made with text weights 'others'"),
         ({"suite": "own"}, [], "", "no simulator to be measured in"),
         ({"suite": "none"}, [], "", "unknown suite 'none'"),

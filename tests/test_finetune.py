@@ -412,6 +412,7 @@ REFUSED = {
     "--data nowhere.npz --checkpoint {run}": "is no name",
     "--data {recorded}/reach.npz --task drawer-close": "is a recording of reach, not of drawer-",
     "--data otherwise.npz": "otherwise.npz was recorded with another camera",
+    "--data wide.npz --checkpoint {run} --out old --overwrite": "the policy 4: use",
     "--data own.npz --checkpoint {run} --out taken": "taken cannot be written to",
     "--data own.npz --checkpoint {run} --out {run} --overwrite": "holds a training run",
 }
@@ -433,6 +434,8 @@ def files(recorded):
     reach.meta["camera"] = "another"
     data.save_demonstrations("otherwise.npz", reach)
     Path("taken").write_text("a file")
+    Path("old").mkdir()
+    Path("old/success.json").write_text("{}")  # results that a mistake must not cost
 
 
 @pytest.mark.parametrize("options", REFUSED)
