@@ -127,6 +127,16 @@ HIDDEN_METHOD = {
     "inner-first-order": f"{INNER} --maml first",
     "both": "",
 }
+# As many windows a step as "demonstration" has, 80, of fewer or more goals than its 160
+NUMBERS_OF_GOALS = {
+    "demonstration-5-goals": "--base-tasks 5 --tasks-per-step 5 --support 8 --query 8",
+    "demonstration-20-goals": "--base-tasks 20 --tasks-per-step 20 --support 2 --query 2",
+    "demonstration-40-goals": "--base-tasks 40",
+    "demonstration-80-goals": "--base-tasks 80",
+    "demonstration-320-goals": "--base-tasks 320",
+}
+for variant, flags in NUMBERS_OF_GOALS.items():
+    HIDDEN_METHOD[variant] = f"--maml off {flags}"
 ADAPTED = ("inner", "inner-first-order")
 MULTI_TASK = ("neither", "neither-as-long")
 READERS = ("demonstration", "demonstration-twice-the-rate")
@@ -145,7 +155,7 @@ def hidden_reports() -> dict[str, tuple[str, Sequence[str]]]:
         # All goals share their starts, and five are few where some of them are hard.
         "starts": (f"{novel} --episodes 20", READERS),
         "parts": (f"{novel} --controls last-frame no-actions shuffled", READERS),
-        "0-steps": (novel, (*ADAPTED, *MULTI_TASK)),
+        "0-steps": (novel, (*ADAPTED, *MULTI_TASK, *NUMBERS_OF_GOALS)),
         "1-steps-swap": (f"{novel} --inner-steps 1 --swap demonstration", ("inner",)),
     }
     for steps, rate in MULTI_TASK_RATES.items():
@@ -153,7 +163,8 @@ def hidden_reports() -> dict[str, tuple[str, Sequence[str]]]:
         reports[f"{steps}-steps"] = (adapted, (*ADAPTED, "both"))
         reports[f"{steps}-steps-best-rate"] = (f"{adapted} --inner-lr {rate}", MULTI_TASK)
     by_adamw = "finetune.py --task novel --checkpoint {run} --curve 1 5 20"
-    reports["adamw"] = (by_adamw, tuple(HIDDEN_METHOD))  # the last, since it takes longest
+    adapted = (*READERS, "both", *ADAPTED, *MULTI_TASK)
+    reports["adamw"] = (by_adamw, adapted)  # the last, since it takes longest
     return reports
 
 

@@ -12,12 +12,24 @@ from model import PolicyConfig
 from report import wilson_interval
 from simulator import SIMULATORS
 from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
-from tests.runs import HIDDEN_METHOD, HIDDEN_REPORTS, LIMITS, LONGER, SEED, TUNING, VARIANTS
+from tests.runs import (
+    HIDDEN_METHOD,
+    HIDDEN_REPORTS,
+    LIMITS,
+    LONGER,
+    SEED,
+    TUNING,
+    UNNAMED_METHOD,
+    UNNAMED_REPORTS,
+    UNNAMED_SUITES,
+    VARIANTS,
+)
 from train import SETTINGS, Settings, parse
 
 HELD = json.loads(RESULTS.read_text())
 HIDDEN = {name: run for name, run in HELD.items() if name.startswith("goals-")}
-ML = {name: run for name, run in HELD.items() if name not in HIDDEN}
+UNNAMED = {name: run for name, run in HELD.items() if name.startswith(UNNAMED_SUITES)}
+ML = {name: run for name, run in HELD.items() if name not in HIDDEN and name not in UNNAMED}
 
 # RESULTS.json keeps every record as it was written, with the names that were used that day. These
 # have another one today.
@@ -126,22 +138,40 @@ def test_every_result_says_how_it_was_measured():
                 assert len({len(episodes) for episodes in tasks.values()}) == 1
 
 
+def check_training(name, suite, flags):
+    """A run was trained on this suite, with these flags, from the seed in its name."""
+    training = HELD[name]["training"]
+    arguments, config = training["arguments"], training["config"]
+    for flag, value in vars(parse(flags.split())).items():
+        if value is not None and flag != "resume":
+            assert {**arguments, **config}[flag] == value, (name, flag)
+    assert arguments["seed"] == int(name[-1]) and arguments["suite"] == suite
+    assert {"command", "hardware", "minutes"} <= set(training)
+
+
+def test_runs_on_tasks_without_a_name_are_those_of_the_queue():
+    for name, run in UNNAMED.items():
+        suite, variant = re.fullmatch(rf"({'|'.join(UNNAMED_SUITES)})-(.+)-seed\d", name).groups()
+        check_training(name, suite, UNNAMED_METHOD[variant])
+        for part in run:
+            if part == "training":
+                continue
+            assert variant in UNNAMED_REPORTS[suite][part][1]
+            assert run[part]["provenance"]["seed"] == SEED
+            for tasks in run[part]["successes"].values():
+                assert {len(digits) for digits in tasks.values()} == {20}
+
+
 def test_runs_on_hidden_goals_are_those_of_the_queue_and_say_how_they_were_measured():
     for name, run in HIDDEN.items():
-        named = re.fullmatch(r"(goals-(reach|push|pick-place))-([a-z-]+)(?:-seed\d)?", name)
+        named = re.fullmatch(r"(goals-(reach|push|pick-place))-(.+?)(?:-seed\d)?", name)
         suite, skill, variant = named.groups()
         assert suite in SIMULATORS
         reports = {part: run[part] for part in run if part != "training"}
         if variant == "controls":
             assert list(reports) == ["novel"]
         else:
-            arguments, config = run["training"]["arguments"], run["training"]["config"]
-            given = vars(parse(HIDDEN_METHOD[variant].split()))
-            for flag, value in given.items():
-                if value is not None and flag != "resume":
-                    assert {**arguments, **config}[flag] == value, (name, flag)
-            assert arguments["seed"] == int(name[-1]) and arguments["suite"] == suite
-            assert {"command", "hardware", "minutes"} <= set(run["training"])
+            check_training(name, suite, HIDDEN_METHOD[variant])
             assert all(variant in HIDDEN_REPORTS[report][1] for report in reports)
         for part, report in reports.items():
             assert {"command", "hardware", "date"} <= set(report["provenance"])
