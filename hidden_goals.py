@@ -25,7 +25,6 @@ from functools import cached_property
 from typing import ClassVar
 
 import gymnasium
-import mujoco
 import numpy as np
 
 from camera import RayCastCamera
@@ -57,6 +56,7 @@ SMALL_RECIPE = {
     "camera": [*RECIPE["camera"][:2], CAMERA_PIXELS],
     "num_points": NUM_POINTS,
     "success": "at the end",
+    "rests_after": None,  # the expert needs no rest for that
 }
 
 # What pictures are drawn from, which show the goal.
@@ -110,6 +110,8 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         episode_steps: the length of an episode.
     """
 
+    rest_after = None
+
     def __init__(self, task: str, num_points: int = NUM_POINTS, *, episode_steps: int):
         skill, _, _ = split_name(task)
         super().__init__(skill, num_points, episode_steps=episode_steps)
@@ -118,10 +120,9 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         self.goal = goal_of(task)
 
         # Meta-World clips the goal that its expert reads to the goal space, which is narrower than
-        # ours. It keeps the space of observations that follows from it, so that is dropped.
+        # ours. The space of observations, which follows from it, is not made yet.
         low, high = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 1.5, 1.0])
         self.sawyer_env.goal_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
-        self.sawyer_env.__dict__.pop("sawyer_observation_space", None)
 
         self.camera = self.make_camera(CAMERA_PIXELS, hidden_sites=("goal",))
 
@@ -151,9 +152,7 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         height = sawyer_env.init_config["obj_init_pos"][2]
         sawyer_env._freeze_rand_vec = True  # not drawn: object and goal are these
         sawyer_env._last_rand_vec = np.array([*position, height, *self.goal])
-        self.expert_observation, _ = sawyer_env.reset()
-        mujoco.mj_forward(sawyer_env.model, sawyer_env.data)
-        self.steps = 0
+        super().begin(seed)
 
     def expert_action(self) -> np.ndarray:
         """Returns the scripted expert's action (4,) float32 in [-1, 1] for the present moment.

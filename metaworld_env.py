@@ -100,6 +100,7 @@ WORKSPACE = ((-0.55, 0.3, -0.05), (0.6, 1.0, 0.48))  # the table and its holes, 
 NUM_POINTS = 512
 EPISODE_STEPS = 200
 FINGERTIP_TASKS = ("reach", "reach-wall")  # won by bringing the fingertips to the goal
+REST_AFTER = 20  # after so many steps of success in a row the expert rests
 
 # How recordings are made. One that was made in another way is refused by `simulator.collect`.
 RECIPE = {
@@ -110,6 +111,7 @@ RECIPE = {
     "num_points": NUM_POINTS,
     "sampling": "farthest points",
     "expert": "Meta-World's, with the fingertips at the goal of reach and reach-wall",
+    "rests_after": REST_AFTER,
     "positions_in_state": 3,  # hand and fingers; actions begin with a displacement of the hand
 }
 
@@ -135,6 +137,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
     """
 
     metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 80}
+    rest_after: ClassVar[int | None] = REST_AFTER  # None: the expert never rests
 
     def __init__(
         self,
@@ -151,6 +154,8 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         self.render_mode = render_mode
         self.episode_steps = episode_steps
         self.steps = 0  # since the beginning of the episode
+        self.successes_in_a_row = 0  # up to the present moment
+        self.gripper = 0.0  # the last number of the last action
 
         sawyer_env = env_dict.ALL_V3_ENVIRONMENTS[f"{task}-v3"]()
         sawyer_env._set_task_called = True
@@ -217,6 +222,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         # Moves the goal markers to this episode's goal: they are still where the last one had them.
         mujoco.mj_forward(self.sawyer_env.model, self.sawyer_env.data)
         self.steps = 0
+        self.successes_in_a_row = 0
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
         """Takes one step: `advance`, then `observe`."""
@@ -232,6 +238,8 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         action = np.clip(action, -1, 1)
         self.expert_observation, reward, _, _, info = self.sawyer_env.step(action)
         self.steps += 1
+        self.successes_in_a_row = self.successes_in_a_row + 1 if info["success"] else 0
+        self.gripper = float(action[3])
         truncated = self.steps >= self.episode_steps
         return float(reward), truncated, {"success": bool(info["success"])}
 
@@ -269,10 +277,16 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
     def expert_action(self) -> np.ndarray:
         """Returns the scripted expert's action (4,) float32 in [-1, 1] for the present moment.
 
+        After `rest_after` steps of success in a row it rests: the hand stays where it is, and the
+        gripper as it is. Meta-World's experts go on, and some undo what they did: that of door-open
+        lets the door go, and that of window-open pushes to and fro.
+
         Reach is a success where the fingertips are within 5 cm of the goal, but Meta-World's expert
         brings the hand there, which is 4.5 cm above them: half a centimetre lower would be a
         failure. It is therefore told a goal that is as much higher.
         """
+        if self.rest_after is not None and self.successes_in_a_row >= self.rest_after:
+            return np.array([0, 0, 0, self.gripper], dtype=np.float32)
         observation = self.expert_observation.copy()
         if self.expert_brings_fingertips:
             hand = self.sawyer_env.data.body("hand").xpos

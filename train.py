@@ -144,9 +144,9 @@ SETTINGS = {
     "paper": Settings(),
     "small": Settings(
         preset="small", steps=8_000, support=4, query=12, lr=1e-3, warmup=100,
-        pretrain_fraction=0.9,  # a third of the time, nearly the same gradient
+        pretrain_fraction=0.9,  # such a step takes a third of the time; its gradient is alike
         after_success=20,  # three fifths of the experts' frames are later ...
-        late_fraction=0.15,  # ... and show how to stay; many of them cost success elsewhere
+        late_fraction=0.2,  # ... and show how to stay; many of them cost success elsewhere
         instruction_dropout=0.2,  # otherwise the policy ignores the demonstration
         task_dropout=0.25, inner_lr=3e-3,  # without task inputs the inner step must find the task
         vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=8_000,
@@ -215,7 +215,7 @@ SUITE_SETTINGS = {
 
 
 def preset_settings(preset: str, suite: str) -> Settings:
-    """A preset's settings on a suite; those of a suite's validation are the suite's own."""
+    """A preset's settings on a suite; goals-reach-validation has those of goals-reach."""
     name = suite.removesuffix("-validation")
     changes = dict(SUITE_SETTINGS.get(name, {}))
     if preset == "small" and name.startswith("goals-"):
@@ -243,8 +243,8 @@ def task_batch(
 
     Where the instruction names the task, a policy need read nothing else. In a fraction of the
     batches (`instruction_dropout`) zeros therefore take its place, and only the demonstration tells
-    the task. Where an inner step follows (`inner`), in a fraction of them (`task_dropout`) the
-    demonstration is zeros as well: then only the support windows tell the task.
+    the task. Where an inner step follows (`inner`), both are zeros in a fraction of the batches
+    (`task_dropout`): then only the support windows tell the task.
 
     Returns the keyword arguments of `policy.loss`, on the device of `text`. They follow from `seed`
     alone.
@@ -271,7 +271,7 @@ def task_batch(
 
 
 def multi_task_loss(policy: DAMIPolicy, batches: list[dict[str, Tensor]]) -> Tensor:
-    """The mean loss () of all windows of all tasks, whose batches are as long as each other."""
+    """The mean loss () of all windows of all tasks, whose batches have equally many windows."""
     if len({batch["demo_points"].shape for batch in batches}) == 1:  # demonstrations can be stacked
         batches = [{name: torch.cat([b[name] for b in batches]) for name in batches[0]}]
     return torch.stack([policy.loss(**batch) for batch in batches]).mean()
@@ -492,7 +492,7 @@ def meta_train(
 SAVE_SECONDS = 20
 SAVE_SHARE = 0.04
 
-# These may differ when a run is resumed. Only `vectorize` changes results, in their last bits.
+# These may differ when a run is resumed. Only `vectorize` changes weights, in their last bits.
 FREE_TO_CHANGE = ("vectorize", "checkpoint_every", "evaluate_every", "episodes")
 # These may differ as long as there was no inner step.
 OF_INNER_STEP = ("maml", "inner_lr", "learn_inner_lr", "rate_lr", "task_dropout")
@@ -654,7 +654,9 @@ class Evaluation:
             return None
         for line in read_json_lines(self.folder / "metrics.jsonl"):
             if line["step"] == step and "successes_at_end" in line:
-                return Outcomes(line["successes"], line["successes_at_end"])
+                logged = Outcomes(line["successes"], line["successes_at_end"])
+                if all(len(x) == settings.episodes for x in logged.any_step.values()):
+                    return logged  # otherwise --episodes was another then
         try:
             with stop.suspended():
                 outcomes = self.roll_out(self.folder / f"ema-{step:05d}.pt")
@@ -708,7 +710,11 @@ class Evaluation:
         """Writes goals.gif: the first two tasks, from one start."""
         policy, _ = evaluate.load_trained(checkpoint, self.device)
         samplers = [
-            WindowSampler(load_demonstrations(path), policy.config, device=self.device)
+            WindowSampler(
+                load_demonstrations(path).take(self.n_demonstrations),
+                policy.config,
+                device=self.device,
+            )
             for path in list(self.recordings.values())[:2]
         ]
         evaluate.write_animation(
@@ -727,8 +733,9 @@ def log_heldout_errors(
     """Logs the average policy's action errors on held-out episodes, and writes held-out.md.
 
     One of its tables has the errors of each task, at the first and at the last step at which they
-    were measured; the other one those of each number of an action, as means over tasks. After the
-    last step of training it also has what the policy does of the task inputs and of inner steps.
+    were measured. The other one has the errors of each number of an action, as means over tasks;
+    after the last step of training also with other demonstrations, and after inner steps
+    (`heldout_controls`).
     """
     policy = state.average.module
     measured = evaluate.evaluate_heldout(policy, train_samplers, heldout_samplers, text)
@@ -785,20 +792,22 @@ def heldout_controls(
         rows["another task's demonstration"] = mean_of_tasks(measure(swap_demonstrations=True))
     if policy.reads_demonstration:
         rows["zeros for a demonstration"] = mean_of_tasks(measure(demonstration_control="zeros"))
-    if settings.maml == "off":
+    if settings.pretrain_steps == settings.steps:  # there was no inner step in training
         return rows
 
     params = {name: p.detach() for name, p in policy.named_parameters()}
     for steps in (1, 5):
         measured = {}
         for i, (task, heldout_sampler) in enumerate(heldout_samplers.items()):
+            sampler = copy.copy(train_samplers[task])
+            sampler.augment = False  # finetune.py --inner-steps, too, leaves scenes as they are
             support = task_batch(
                 policy,
-                train_samplers[task],
+                sampler,
                 text[task],
                 n=settings.support,
                 seed=(settings.seed, settings.steps, i),  # a step that no training takes
-                settings=Settings(),  # no dropout
+                settings=replace(settings, instruction_dropout=0.0, task_dropout=0.0),
             )
             adapted = copy.deepcopy(policy)
             adapted.load_state_dict(
@@ -855,7 +864,9 @@ def report_training(
 
 # ---- From the command line to a run --------------------------------------------------------------
 
-OWN_FRAMES = 500  # learned positions for own demonstrations; the paper's number on a real robot
+# An own demonstration may have so many frames, or as many as the longest of its recordings; 500 is
+# the paper's number on a real robot.
+OWN_FRAMES = 500
 # The fields of PolicyConfig that are flags
 ARCHITECTURE = ("policy", "demo_encoder", "denoiser", "tcfm", "sampler", "num_points")
 
@@ -933,12 +944,6 @@ def draw_base_tasks(base_tasks: Sequence[str], settings: Settings) -> list[str]:
     return [base_tasks[i] for i in sorted(drawn)]
 
 
-def build_empty(config: PolicyConfig) -> DAMIPolicy:
-    """A policy whose weights are neither drawn nor stored, to ask what it is like."""
-    with torch.device("meta"):
-        return model.build_policy(config)
-
-
 def choose_settings(
     args: argparse.Namespace, preset: str, suite: str, config: PolicyConfig
 ) -> Settings:
@@ -946,7 +951,7 @@ def choose_settings(
     settings = preset_settings(preset, suite)
     if suite == "own":  # all demonstrations, and no simulator to be rolled out in
         settings = replace(settings, demonstrations=None, episodes=0)
-    if not build_empty(config).reads_demonstration:  # then the instruction alone tells the task
+    if config.demo_encoder == "none":  # then the instruction alone tells the task
         settings = replace(settings, instruction_dropout=0.0, task_dropout=0.0)
     return common.with_flags(settings, args)
 
@@ -1105,7 +1110,9 @@ def run(
     provenance = {"text weights": text_weights, **provenance}
 
     n_demonstrations = None
-    if settings.evaluate_on == "base" and settings.demonstrations is not None:
+    if simulator is not None and settings.evaluate_on == "novel":
+        n_demonstrations = simulator.demonstrations
+    elif settings.demonstrations is not None:
         n_demonstrations = settings.demonstrations - settings.held_out
 
     # What every checkpoint says, what last.pt says besides, and where results are measured
@@ -1138,7 +1145,8 @@ def run(
         if rank == 0 and state.step > 0:
             last_checkpoint = folder / f"ema-{state.step:05d}.pt"
             if is_milestone(state.step, settings) and not last_checkpoint.exists():
-                save_average(folder, state, checkpoint_info)  # of flags that changed on --resume
+                # Missing where --checkpoint-every or --evaluate-every changed on --resume
+                save_average(folder, state, checkpoint_info)
             outcomes = evaluation.run(state.step, stop)  # the run may have been stopped during it
         began = time.monotonic()
         for figures in meta_train(state, train_samplers, text, settings, rank=rank, world=world):

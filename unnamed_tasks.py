@@ -108,6 +108,8 @@ class PairEnv(MetaWorldPointCloudEnv):
         episode_steps: the length of an episode.
     """
 
+    rest_after = None
+
     def __init__(self, task: str, num_points: int = NUM_POINTS, *, episode_steps: int):
         super().__init__(task.removesuffix("-hidden"), num_points, episode_steps=episode_steps)
         self.task = task
@@ -135,8 +137,10 @@ class PairEnv(MetaWorldPointCloudEnv):
         scene, data = SCENES[self.scene], self.sawyer_env.data
         data.joint(scene.joint).qpos[:] = scene.joint_start
         mujoco.mj_forward(self.sawyer_env.model, data)
+        self.sawyer_env._get_obs()  # an observation holds the one before, which is to be of now
         self.expert_observation = self.sawyer_env._get_obs()
         self.steps = 0
+        self.successes_in_a_row = 0
         self.other_successes = []
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
@@ -203,6 +207,8 @@ class TurnedActionsEnv(MetaWorldPointCloudEnv):
         num_points: N of a cloud.
         episode_steps: the length of an episode.
     """
+
+    rest_after = None
 
     def __init__(self, task: str, num_points: int = NUM_POINTS, *, episode_steps: int):
         skill, _, _ = task.split("-")

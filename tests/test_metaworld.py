@@ -97,6 +97,28 @@ def test_the_expert_of_reach_brings_the_fingertips_to_the_goal(task):
         assert info["success"] and away < 0.02  # Meta-World's own ends 4.5 cm away, and 5 is lost
 
 
+def test_the_expert_of_door_open_rests_where_metaworlds_own_lets_the_door_go():
+    successes = {}  # rest_after -> those of each step
+    for rest_after in (metaworld_env.REST_AFTER, None):
+        env = MetaWorldPointCloudEnv("door-open")
+        env.rest_after = rest_after
+        env.begin(0)
+        taken, successes[rest_after] = [], []
+        for _ in range(env.episode_steps):
+            taken.append(env.expert_action())
+            successes[rest_after].append(env.advance(taken[-1])[2]["success"])
+        if rest_after is not None:
+            succeeds = successes[rest_after].index(True)
+            rests = succeeds + rest_after
+            actions = np.array(taken)
+            assert all(successes[rest_after][succeeds:])
+            assert np.any(actions[rests - 1, :3]) and not np.any(actions[rests:, :3])
+            np.testing.assert_array_equal(actions[rests:, 3], actions[rests - 1, 3])
+            env.begin(0)
+            np.testing.assert_array_equal(env.expert_action(), taken[0])  # it rests no longer
+    assert any(successes[None]) and not successes[None][-1]
+
+
 def test_the_goal_marker_is_in_the_cloud(reach):
     for seed in range(5):
         observation, _ = reach.reset(seed=seed)

@@ -521,11 +521,11 @@ def test_a_run_stopped_while_it_is_evaluated_is_evaluated_when_resumed(
 def test_a_run_is_evaluated_and_resumed_where_it_was_asked_for(bowl, monkeypatch, capsys):
     evaluated = []
 
-    def evaluate_and_stop(checkpoint, **_):
+    def evaluate_and_stop(checkpoint, episodes, **_):
         evaluated.append(checkpoint.stem)
         if evaluated == ["ema-00002"]:
             signal.raise_signal(signal.SIGINT)
-        outcomes = {"pour": [True], "stir": [True]}
+        outcomes = {"pour": [True] * episodes, "stir": [True] * episodes}
         return report.Outcomes(any_step=outcomes, at_end=outcomes)
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", evaluate_and_stop)
@@ -535,6 +535,10 @@ def test_a_run_is_evaluated_and_resumed_where_it_was_asked_for(bowl, monkeypatch
     assert end.value.code == 130 and "add --resume to go on" in capsys.readouterr().err
     train.main([*argv, "--resume"])
     assert evaluated == [f"ema-{step:05d}" for step in (2, 2, 4)]
+    train.main([*argv, "--resume"])  # is read from the log
+    assert len(evaluated) == 3
+    train.main([*argv, "--resume", "--episodes", "7"])  # of another number: not
+    assert evaluated[3:] == ["ema-00004"]
 
 
 def test_saving_takes_a_few_per_cent_of_the_time(tmp_path, monkeypatch):
