@@ -3,11 +3,14 @@
 import functools
 import hashlib
 import os
+import shutil
 import signal
 from contextlib import contextmanager
+from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before torch; on small matrices threads wait
 
+import filelock
 import pytest
 import torch
 
@@ -17,6 +20,7 @@ import common
 import evaluate
 import metaworld_env
 import model
+import report
 import simulator
 import train
 from clip import TextWeightsError
@@ -31,13 +35,47 @@ FEW = (
     "--clip-weights random --device cpu"
 ).split()
 
+# In which order files are tested, so that no process is left with a long one at the end. That of
+# the robot mostly waits, since it needs real time.
+ORDER = (
+    "robot model maml clip convert notebook train camera baselines finetune evaluate common "
+    "hidden_goals fuzz metaworld simulator seams rl rlbench unnamed_tasks data report readme "
+    "results house"
+).split()
+
+
+def pytest_configure(config):
+    config.option.loadscopereorder = False  # otherwise xdist sorts files by their number of tests
+
+
+def pytest_collection_modifyitems(items):
+    places = {f"test_{name}.py": place for place, name in enumerate(ORDER)}
+    items.sort(key=lambda item: places.get(item.path.name, len(ORDER)))
+
+
+def made_once(factory, name, make):
+    """A folder that `make(folder)` fills, once for all processes of pytest-xdist."""
+    root = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+    folder, done = root / name, root / f"{name}.done"
+    with filelock.FileLock(root / f"{name}.lock"):
+        if not done.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+            done.touch()
+    return folder
+
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory):
     """A folder with two expert demonstrations of each task in BASE and NOVEL."""
-    folder = tmp_path_factory.mktemp("demonstrations")
-    simulator.collect(metaworld_env.MetaWorld(), BASE + NOVEL, folder, episodes=2)
-    return folder
+
+    def make(folder):
+        simulator.collect(metaworld_env.MetaWorld(), BASE + NOVEL, folder, episodes=2)
+
+    return made_once(tmp_path_factory, "demonstrations", make)
 
 
 @contextmanager
@@ -68,6 +106,12 @@ def nothing_kept(monkeypatch):
 
 
 @pytest.fixture
+def no_pictures(monkeypatch):
+    """No charts are drawn, which takes a third of a second each; their files are empty."""
+    monkeypatch.setattr(report, "save_png", lambda figure, path, **_: Path(path).touch())
+
+
+@pytest.fixture
 def own_folder(tmp_path, monkeypatch):
     """The test runs in an empty folder, and leaves the process as it was."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -83,13 +127,14 @@ def own_folder(tmp_path, monkeypatch):
 @pytest.fixture(scope="session")
 def run(recorded, tmp_path_factory):
     """The folder of a run of train.py with evaluation, to be left as it is."""
-    folder = tmp_path_factory.mktemp("trained")
-    with three_tasks() as patch:
-        patch.chdir(folder)
-        patch.setattr(evaluate, "EPISODES_A_JOB", 1)  # jobs enough for both workers
-        options = "--episodes 2 --evaluate-every 6 --workers 2".split()
-        train.main([*FEW, *options, "--data", str(recorded)])
-    return folder / "runs" / "ml10-tiny-seed0"
+
+    def make(folder):
+        with three_tasks() as patch:
+            patch.chdir(folder)
+            options = "--episodes 2 --evaluate-every 6 --workers 1".split()
+            train.main([*FEW, *options, "--data", str(recorded)])
+
+    return made_once(tmp_path_factory, "trained", make) / "runs" / "ml10-tiny-seed0"
 
 
 def fails(script, argv, capsys):

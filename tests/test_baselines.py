@@ -402,7 +402,7 @@ def test_presets_are_of_one_size_and_the_table_counts_them(monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", ["dp3", *NEW])
 def test_a_policy_is_trained_resumed_adapted_and_rolled_out(
-    name, recorded, small_suite, own_folder, monkeypatch
+    name, recorded, small_suite, own_folder, no_pictures, monkeypatch
 ):
     argv = [*FEW, "--policy", name, "--data", str(recorded), "--vectorize", "3"]
     argv += ["--steps", "2", "--checkpoint-every", "2"]

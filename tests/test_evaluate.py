@@ -50,7 +50,7 @@ def run_here(job, jobs, *, total, description, unit, workers, pool):
 
 
 @pytest.fixture(autouse=True)
-def toy(monkeypatch, own_folder):
+def toy(monkeypatch, own_folder, no_pictures):
     """The toy is one of the simulators, and nothing is rolled out in other processes."""
     monkeypatch.setitem(simulator.SIMULATORS, "toy", ToySimulator)
     monkeypatch.setattr(evaluate, "text_features", features)

@@ -18,7 +18,7 @@ import finetune
 import model
 import report
 
-pytestmark = pytest.mark.usefixtures("small_suite", "own_folder")
+pytestmark = pytest.mark.usefixtures("small_suite", "own_folder", "no_pictures")
 
 
 def adapting(run, recorded, options="", task="door-close"):

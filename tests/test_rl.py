@@ -205,7 +205,7 @@ def test_it_learns_to_find_a_goal_that_only_rewards_tell():
 
 
 @pytest.fixture
-def point_suite(monkeypatch, tmp_path):
+def point_suite(monkeypatch, tmp_path, no_pictures):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(SIMULATORS, "point", PointSimulator)
     monkeypatch.setattr(rl, "run_jobs", lambda job, jobs, **_: InProcessPool().run(job, jobs))

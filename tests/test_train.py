@@ -34,7 +34,7 @@ ROOT = Path(train.__file__).resolve().parent
 SHORT = (
     "--preset tiny --steps 4 --checkpoint-every 2 --clip-weights random --device cpu --threads 1"
 ).split()
-pytestmark = pytest.mark.usefixtures("small_suite", "own_folder", "no_curves")
+pytestmark = pytest.mark.usefixtures("small_suite", "own_folder", "no_curves", "no_pictures")
 
 
 @pytest.fixture
