@@ -9,10 +9,11 @@ simulator.py knows of all this.
 Letters: N points of an observation.
 """
 
+import copy
 import warnings
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, ClassVar
 
 import gymnasium
@@ -157,7 +158,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         self.successes_in_a_row = 0  # up to the present moment
         self.gripper = 0.0  # the last number of the last action
 
-        sawyer_env = env_dict.ALL_V3_ENVIRONMENTS[f"{task}-v3"]()
+        sawyer_env = make_sawyer_env(task)
         sawyer_env._set_task_called = True
         sawyer_env._freeze_rand_vec = False  # draw objects and goals at each reset ...
         sawyer_env.seeded_rand_vec = True  # ... from a generator of its own, not NumPy's global
@@ -300,6 +301,27 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
     def close(self) -> None:
         self.sawyer_env.close()
+
+
+@lru_cache(maxsize=4)  # few, since they are large
+def compile_scene(path: str) -> mujoco.MjModel:
+    """The scene that a file of MuJoCo describes."""
+    return mujoco.MjModel.from_xml_path(path)
+
+
+def make_sawyer_env(task: str) -> Any:
+    """Makes Meta-World's environment of a task.
+
+    Four fifths of the time would go into compiling its scene. That is done once in a process, and
+    every environment gets a copy of the result.
+    """
+
+    class SawyerEnv(env_dict.ALL_V3_ENVIRONMENTS[f"{task}-v3"]):
+        def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+            model = copy.copy(compile_scene(self.fullpath))
+            return model, mujoco.MjData(model)
+
+    return SawyerEnv()
 
 
 def touching_object(sawyer_env: Any, object_geom_id: int) -> bool:

@@ -24,11 +24,10 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
-from metaworld import env_dict
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
 from hidden_goals import CAMERA_PIXELS, HAND_HIGH, HAND_LOW, NUM_POINTS, SMALL_RECIPE, HiddenGoals
-from metaworld_env import INSTRUCTIONS, MetaWorldPointCloudEnv
+from metaworld_env import INSTRUCTIONS, MetaWorldPointCloudEnv, make_sawyer_env
 
 # ---- Pairs of tasks in one scene -----------------------------------------------------------------
 
@@ -118,7 +117,7 @@ class PairEnv(MetaWorldPointCloudEnv):
 
         # The other task's environment judges the same simulation: it is given its model and data.
         other_name = other_of_pair(task).removesuffix("-hidden")
-        self.other_env = env_dict.ALL_V3_ENVIRONMENTS[f"{other_name}-v3"]()
+        self.other_env = make_sawyer_env(other_name)
         self.other_env._set_task_called = True
         self.other_env.model = self.sawyer_env.model
         self.other_env.data = self.sawyer_env.data
