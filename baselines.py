@@ -171,12 +171,13 @@ def associative_scan(a: Tensor, b: Tensor) -> Tensor:
     all places at once, where the recurrence takes L. What came before the first changes nothing.
     """
     reach = 1
-    while reach < b.shape[1]:
+    while True:  # once even where L is 1, so that `a` has a gradient there: zero
         before_a = torch.cat([torch.ones_like(a[:, :reach]), a[:, :-reach]], dim=1)
         before_b = torch.cat([torch.zeros_like(b[:, :reach]), b[:, :-reach]], dim=1)
         a, b = a * before_a, a * before_b + b
         reach *= 2
-    return b
+        if reach >= b.shape[1]:
+            return b
 
 
 class Mamba(nn.Module):
@@ -636,7 +637,8 @@ demo_encoders["mlp"] = DemonstrationMLP
 
 def without_task(preset: str, **changes: Any) -> PolicyConfig:
     """DAMI's preset of a name with `changes`, for a policy that reads no task."""
-    return replace(model.PRESETS[preset], demo_encoder="none", tcfm="none", **changes)
+    given = {"demo_encoder": "none", "tcfm": "none", "action_error": "squared"}
+    return replace(model.PRESETS[preset], **given, **changes)
 
 
 # The configurations by policy and preset. `paper`: as the published code is run; `small`: about

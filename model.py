@@ -76,6 +76,7 @@ class PolicyConfig:
     diffusion_steps: int = 100  # K
     inference_steps: int = 10
     sampler: str = "dp3"  # ddim | dp3, see DiffusionSchedule.step
+    action_error: str = "squared"  # squared | huber, see `DAMIPolicy.error`
 
     def __post_init__(self):
         # JSON brings lists back where tuples went in.
@@ -618,6 +619,7 @@ class DAMIPolicy(nn.Module):
 
     # What a subclass may override:
     requires: ClassVar[dict[str, str]] = {}  # the fields of its configuration with only one value
+    HUBER_DELTA: ClassVar[float] = 0.05  # of actions from -1 to 1: up to here errors are squared
     conditioned_by_h: ClassVar[bool] = True  # whether its denoiser is modulated by h_k
 
     def __init__(self, config: PolicyConfig):
@@ -740,7 +742,7 @@ class DAMIPolicy(nn.Module):
         timesteps: Tensor,
         **task: Tensor,
     ) -> Tensor:
-        """The diffusion loss, () float: squared error of the predicted clean actions (Eq. 1).
+        """The diffusion loss, () float: the error of the predicted clean actions (Eq. 1).
 
         It is the mean over windows and over a window's H * A numbers, as in DP3's code. The paper
         writes a squared norm, their sum: 64 times as much at H = 16, A = 4. AdamW does not feel the
@@ -762,7 +764,19 @@ class DAMIPolicy(nn.Module):
         clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
         noisy = self.schedule.add_noise(clean, noise, timesteps)  # A_k, (B, H, A)
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
-        return F.mse_loss(self.denoise(noisy, timesteps, observation, context), clean)
+        return self.error(self.denoise(noisy, timesteps, observation, context), clean)
+
+    def error(self, prediction: Tensor, clean: Tensor) -> Tensor:
+        """The error () of predicted actions, of clean ones; both (B, H, A), normalized.
+
+        "squared" is the mean square. What it is least for is the mean of the actions that an
+        observation leaves possible. Where nearly all of them rest and a few still move on, that
+        mean moves a little, at every step, and carries the hand away. "huber" counts what lies
+        above `HUBER_DELTA` linearly. It is least for something like the median, which rests.
+        """
+        if self.config.action_error == "squared":
+            return F.mse_loss(prediction, clean)
+        return 2 * F.huber_loss(prediction, clean, delta=self.HUBER_DELTA)
 
     forward = loss  # so that torch.func.functional_call(policy, params, (), batch) is the loss
 
@@ -855,7 +869,7 @@ class DAMIPolicy(nn.Module):
 class DP3Policy(DAMIPolicy):
     """DP3: the policy without demonstration and instruction."""
 
-    requires: ClassVar = {"demo_encoder": "none", "tcfm": "none"}
+    requires: ClassVar = {"demo_encoder": "none", "tcfm": "none", "action_error": "squared"}
 
 
 def ema_model(policy: DAMIPolicy) -> AveragedModel:
@@ -887,6 +901,7 @@ def choices() -> dict[str, tuple[str, ...]]:
         "demo_encoder": (*demo_encoders, "none"),
         "tcfm": ("down", "mid", "up", "none"),
         "sampler": ("ddim", "dp3"),
+        "action_error": ("squared", "huber"),
     }
 
 
@@ -906,6 +921,7 @@ PRESETS = {
         num_points=128, pointnet_widths=(32, 64, 128), state_feature_dim=32, timestep_dim=64,
         demo_stride=16, demo_positions=13,  # 13 of a demonstration's 200 frames
         unet_widths=(32, 64, 128), n_action_steps=4, inference_steps=5,
+        action_error="huber",
     ),
     "tiny": PolicyConfig(
         num_points=64, pointnet_widths=(16, 32), point_feature_dim=16, state_feature_dim=16,

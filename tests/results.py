@@ -40,7 +40,6 @@ from report import (
 )
 from simulator import simulator_of
 from tests.runs import AGAIN, HIDDEN_REPORTS, REPORTS, UNNAMED_REPORTS
-from unnamed_tasks import ANGLES, DIRECTIONS, SCENES, turned_task
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "assets" / "RESULTS.json"
@@ -143,7 +142,6 @@ class Column:
     report: str
     column: int | str = 0
     at_end: bool = False  # success at the end, not at any step
-    other_task: bool = False  # success, at any step, at the other task of a pair
 
 
 BASE, BEFORE, AFTER = Column("base"), Column("novel", "before"), Column("novel", "after")
@@ -216,8 +214,6 @@ def runs_of(results: Results, variant: str) -> list[dict]:
 def measured(run: dict, column: Column) -> Successes | None:
     """The episodes in a column of a run's report, if there is one."""
     part = "successes at the end" if column.at_end else "successes"
-    if column.other_task:
-        part = "successes at the other task"
     columns = run.get(column.report, {}).get(part, {})
     title = column.column
     if isinstance(title, int):
@@ -533,27 +529,6 @@ def hidden_goals_table(results: Results, skill: str) -> str:
     return format_table(rows)
 
 
-NUMBERS_OF_GOALS = {  # of a training -> its variant, and where it was measured
-    5: ("demonstration-5-goals", Column("0-steps")),
-    20: ("demonstration-20-goals", Column("0-steps")),
-    40: ("demonstration-40-goals", Column("0-steps")),
-    80: ("demonstration-80-goals", Column("0-steps")),
-    160: ("demonstration", Column("novel", 0)),
-    320: ("demonstration-320-goals", Column("0-steps")),
-}
-
-
-def numbers_of_goals_table(results: Results, skill: str) -> str:
-    """The success on novel goals, a row for each number of goals in training."""
-    rows = [[f"{skill}, goals in training", "at any step", "at the end"]]
-    for number, (variant, column) in NUMBERS_OF_GOALS.items():
-        name = f"goals-{skill}-{variant}"
-        cells = [mean(results, name, replace(column, at_end=at_end)) for at_end in (False, True)]
-        if any(cells):
-            rows.append([str(number), *cells])
-    return format_table(rows)
-
-
 HIDDEN_SUMMARY = {  # the most important of these rows -> their titles in README
     "with the goal's own demonstration": "a demonstration of the goal",
     "the same, from 20 starts": "the same, from 20 starts in place of five",
@@ -580,65 +555,6 @@ def hidden_summary_table(results: Results) -> str:
     return format_table(rows)
 
 
-# What is measured where no observation names the task: a title, the variant, and its report. None
-# stands for the reports of tests.runs that show a task the demonstration of another.
-UNNAMED_ROWS = (
-    ("its own demonstration", "demonstration", 0, None),
-    ("its own demonstration without the actions", "demonstration", 2, None),
-    ("another task's demonstration", "demonstration", 3, None),
-    ("zeros in place of a demonstration", "demonstration", 1, None),
-    ("no demonstration, second-order MAML: before any step", "inner", 0, "0-steps"),
-    ("the same, after one inner step", "inner", 0, "1-steps"),
-    ("the same, after five inner steps", "inner", 0, "5-steps"),
-    ("multi-task training", "neither", 0, "multi-task"),
-)
-
-
-def pairs_table(results: Results) -> str:
-    """A row for what a policy has; success at its task and at the other one, by scene."""
-    head_cells = [f"{scene}, {which}" for scene in SCENES for which in ("its task", "the other")]
-    rows = [["success at any step, percent", *head_cells]]
-    for title, variant, place, report in UNNAMED_ROWS:
-        cells = []
-        for scene in SCENES:
-            tasks = [f"{scene}-{direction}-hidden" for direction in DIRECTIONS]
-            for other_task in (False, True):
-                column = Column(report or scene, place, other_task=other_task)
-                cells.append(pooled(results, f"pairs-{variant}", column, tasks))
-        if any(cells):
-            rows.append([title, *cells])
-    return format_table(rows)
-
-
-def convention_table(results: Results, skill: str) -> str:
-    """A row for what a policy has; success on the new angles together."""
-    rows = [[f"{skill}, actions turned by angles never seen", "at any step", "at the end"]]
-    for title, variant, place, report in UNNAMED_ROWS:
-        cells = []
-        for at_end in (False, True):
-            column = Column(report or "angles", place, at_end=at_end)
-            cells.append(mean(results, f"convention-{skill}-{variant}", column))
-        if any(cells):
-            rows.append([title, *cells])
-    return format_table(rows)
-
-
-def angles_table(results: Results, skill: str) -> str:
-    """Success at the end, a row for what a policy has, a column a new angle."""
-    angles = ANGLES["novel"]
-    rows = [["success at the end, percent", *(f"{angle:.0f} degrees" for angle in angles)]]
-    for title, variant, place, report in UNNAMED_ROWS:
-        column = Column(report or "angles", place, at_end=True)
-        cells = []
-        for angle in angles:
-            name = f"convention-{skill}-{variant}"
-            episodes = together(results, name, column, [turned_task(skill, angle)])
-            cells.append(f"{100 * np.mean(episodes):.0f}" if episodes else "")
-        if any(cells):
-            rows.append([title, *cells])
-    return format_table(rows)
-
-
 TABLES: dict[str, Callable[[Results], str]] = {
     "means": means_table,
     "base": lambda results: by_task_table(results, "base"),
@@ -659,10 +575,6 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
     "goals push": lambda results: hidden_goals_table(results, "push"),
     "goals pick-place": lambda results: hidden_goals_table(results, "pick-place"),
-    "goals reach numbers": lambda results: numbers_of_goals_table(results, "reach"),
-    "pairs": pairs_table,
-    "convention reach": lambda results: convention_table(results, "reach"),
-    "convention reach by angle": lambda results: angles_table(results, "reach"),
     "swap": swap_table,
     "reading": reading_table,
 }

@@ -435,6 +435,7 @@ def files(recorded):
     data.save_demonstrations("otherwise.npz", reach)
     Path("taken").write_text("a file")
     Path("old").mkdir()
+    Path("old/.lock").touch()
     Path("old/success.json").write_text("{}")  # results that a mistake must not cost
 
 
