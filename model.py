@@ -619,7 +619,7 @@ class DAMIPolicy(nn.Module):
 
     # What a subclass may override:
     requires: ClassVar[dict[str, str]] = {}  # the fields of its configuration with only one value
-    HUBER_DELTA: ClassVar[float] = 0.05  # of actions from -1 to 1: up to here errors are squared
+    HUBER_DELTA: ClassVar[float] = 0.05  # normalized actions lie in [-1, 1]
     conditioned_by_h: ClassVar[bool] = True  # whether its denoiser is modulated by h_k
 
     def __init__(self, config: PolicyConfig):
@@ -767,12 +767,12 @@ class DAMIPolicy(nn.Module):
         return self.error(self.denoise(noisy, timesteps, observation, context), clean)
 
     def error(self, prediction: Tensor, clean: Tensor) -> Tensor:
-        """The error () of predicted actions, of clean ones; both (B, H, A), normalized.
+        """How far predicted actions are from clean ones, (); both (B, H, A), normalized.
 
-        "squared" is the mean square. What it is least for is the mean of the actions that an
-        observation leaves possible. Where nearly all of them rest and a few still move on, that
-        mean moves a little, at every step, and carries the hand away. "huber" counts what lies
-        above `HUBER_DELTA` linearly. It is least for something like the median, which rests.
+        "squared" is the mean square. It is smallest at the mean of the actions that an observation
+        leaves possible. Where nearly all of these rest and a few still move on, the mean moves a
+        little, at every step, and carries the hand away. "huber" counts linearly what exceeds
+        `HUBER_DELTA`. It is smallest near the median, which rests.
         """
         if self.config.action_error == "squared":
             return F.mse_loss(prediction, clean)

@@ -144,7 +144,7 @@ SETTINGS = {
     "paper": Settings(),
     "small": Settings(
         preset="small", steps=8_000, support=4, query=12, lr=1e-3, warmup=100,
-        pretrain_fraction=0.9,  # such a step takes a third of the time; its gradient is alike
+        pretrain_fraction=0.9,  # without an inner step, one takes a third of the time
         after_success=20,  # three fifths of the experts' frames are later ...
         late_fraction=0.15,  # ... and show how to stay; many of them cost success elsewhere
         instruction_dropout=0.2,  # otherwise the policy ignores the demonstration

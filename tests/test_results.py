@@ -2,13 +2,13 @@
 
 import json
 import re
-from dataclasses import fields
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
 
 from hidden_goals import names_of
-from model import PolicyConfig
+from model import PRESETS, PolicyConfig
 from report import wilson_interval
 from simulator import SIMULATORS
 from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
@@ -24,12 +24,17 @@ from tests.runs import (
     UNNAMED_SUITES,
     VARIANTS,
 )
-from train import SETTINGS, Settings, parse
+from train import SETTINGS, Settings, parse, preset_settings
 
 HELD = json.loads(RESULTS.read_text())
 HIDDEN = {name: run for name, run in HELD.items() if name.startswith("goals-")}
 UNNAMED = {name: run for name, run in HELD.items() if name.startswith(UNNAMED_SUITES)}
-ML = {name: run for name, run in HELD.items() if name not in HIDDEN and name not in UNNAMED}
+SHIPPED = "ml10-small-seed0"
+ML = {
+    name: run
+    for name, run in HELD.items()
+    if name not in HIDDEN and name not in UNNAMED and name != SHIPPED
+}
 
 # RESULTS.json keeps every record as it was written, with the names that were used that day. These
 # have another one today.
@@ -106,6 +111,19 @@ def test_runs_are_of_the_variants_that_they_name():
             if value is not None and flag != "resume":
                 used = (arguments | config).get(flag, "dami")
                 assert used == value, (name, flag)
+
+
+def test_readme_says_how_well_the_policy_that_ships_does_which_was_trained_by_todays_recipe():
+    run, page = HELD[SHIPPED], " ".join((ROOT / "README.md").read_text().split())
+    recipe = asdict(replace(preset_settings("small", "ml10"), episodes=0))  # measured afterwards
+    assert run["training"]["arguments"] == recipe
+    assert run["training"]["config"]["action_error"] == PRESETS["small"].action_error
+    for report, column in (("base", 0), ("novel", 1)):
+        for part in ("successes", "successes at the end"):
+            episodes = "".join(list(run[report][part].values())[column].values())
+            rate = 100 * episodes.count("1") / len(episodes)
+            low, high = wilson_interval(episodes.count("1"), len(episodes))
+            assert f"{rate:.1f} % [{100 * low:.1f}, {100 * high:.1f}]" in page, (report, part)
 
 
 def test_the_settings_of_a_run_are_those_of_today():
