@@ -364,7 +364,10 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
                 f"taken unasked: train with --preset small, or add --checkpoint {run}"
             )
         raise UserError(f"no finished run on {suite} in {runs}/: train one, or name a --checkpoint")
-    print(f"no finished run on {suite} in {runs}/: using the policy that comes with the code")
+    print(
+        f"no finished run on {suite} in {runs}/: using the policy that comes with the code",
+        flush=True,
+    )
     return shipped
 
 

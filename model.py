@@ -124,7 +124,9 @@ class PolicyConfig:
                 f"{levels} levels of unet_widths"
             )
         if self.denoiser == "unet" and self.tcfm == "up" and levels == 1:
-            raise ValueError("tcfm is 'up': of one width in unet_widths no level goes up")
+            raise ValueError(
+                f"tcfm is 'up', and unet_widths {self.unet_widths} have no up-sampling level"
+            )
         if self.diffusion_steps % self.inference_steps:
             raise ValueError(
                 f"diffusion_steps {self.diffusion_steps} is no multiple of "
@@ -767,7 +769,7 @@ class DAMIPolicy(nn.Module):
         return self.error(self.denoise(noisy, timesteps, observation, context), clean)
 
     def error(self, prediction: Tensor, clean: Tensor) -> Tensor:
-        """How far predicted actions are from clean ones, (); both (B, H, A), normalized.
+        """How far predicted actions are from clean ones, () float; both (B, H, A), normalized.
 
         "squared" is the mean square. It is smallest at the mean of the actions that an observation
         leaves possible. Where nearly all of these rest and a few still move on, the mean moves a

@@ -122,7 +122,7 @@ class GaussianPolicy(nn.Module):
         The inner step descends this loss. The outer gradient is taken of it, too, though TRPO's
         outer loss weighs each advantage by the ratio of the action's probabilities under the new
         and the old policy. That gradient is only taken where the new policy is the old one, and
-        there the two losses have the same first derivatives. Of the outer loss no second ones are
+        there the two losses have the same first derivatives. Second ones of the outer loss are not
         needed.
         """
         mean, log_std = functional_call(self, params, batch["states"])
@@ -150,7 +150,7 @@ class Rollouts:
 
 @lru_cache(maxsize=16)  # one takes 0.1 GB, and a suite can have hundreds of tasks
 def environment(simulator: Simulator, task: str) -> Any:
-    """The environment of a task. Each process keeps the last ones."""
+    """The environment of a task. Each process keeps the 16 that it used last."""
     env = simulator.make(task, simulator.recipe["num_points"])
     if not hasattr(env, "state_without_goal"):
         raise UserError(f"{simulator.name} has no low-dimensional states: use --suite ml10 or ml45")

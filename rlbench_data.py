@@ -143,7 +143,7 @@ def read_view(where: Path | str, misc: Mapping[str, Any], camera: str, depth: np
 def seen_points(
     views: Sequence[View], workspace: Sequence[Sequence[float]] = WORKSPACE
 ) -> np.ndarray:
-    """What all cameras see of the workspace, (M, 3) float32 with M of at most 8192.
+    """What all cameras see of the workspace, (M, 3) float32, thinned as `robot.thin` does.
 
     A cloud is made of these by `data.farthest_point_sample`.
     """

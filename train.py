@@ -144,7 +144,7 @@ SETTINGS = {
     "paper": Settings(),
     "small": Settings(
         preset="small", steps=8_000, support=4, query=12, lr=1e-3, warmup=100,
-        pretrain_fraction=0.9,  # without an inner step, one takes a third of the time
+        pretrain_fraction=0.9,  # a step without an inner step takes a third of the time
         after_success=20,  # three fifths of the experts' frames are later ...
         late_fraction=0.15,  # ... and show how to stay; many of them cost success elsewhere
         instruction_dropout=0.2,  # otherwise the policy ignores the demonstration
@@ -933,7 +933,7 @@ def choose_architecture(args: argparse.Namespace, preset: str, suite: str) -> Po
     """The preset's architecture on a suite, with the flags that were given."""
     flags = {name: getattr(args, name) for name in ARCHITECTURE}
     config = baselines.PRESETS[args.policy or "dami"][preset]
-    if suite.removesuffix("-validation") in SUITE_SETTINGS:  # "huber" was not measured there
+    if suite.removesuffix("-validation") in SUITE_SETTINGS:  # "huber" was never measured there
         config = replace(config, action_error="squared")
     try:
         config = replace(config, **{name: x for name, x in flags.items() if x is not None})

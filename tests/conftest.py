@@ -131,7 +131,8 @@ def run(recorded, tmp_path_factory):
     def make(folder):
         with three_tasks() as patch:
             patch.chdir(folder)
-            options = "--episodes 2 --evaluate-every 6 --workers 1".split()
+            patch.setattr(evaluate, "EPISODES_A_JOB", 1)  # jobs enough for both workers
+            options = "--episodes 2 --evaluate-every 6 --workers 2".split()
             train.main([*FEW, *options, "--data", str(recorded)])
 
     return made_once(tmp_path_factory, "trained", make) / "runs" / "ml10-tiny-seed0"

@@ -126,17 +126,16 @@ HIDDEN_METHOD = {
     "inner": INNER,
     "inner-first-order": f"{INNER} --maml first",
     "both": "",
+    # Fewer or more goals than the 160 of "demonstration", and as many windows a step, 80
+    "demonstration-5-goals": "--maml off --base-tasks 5 --tasks-per-step 5 --support 8 --query 8",
+    "demonstration-20-goals": (
+        "--maml off --base-tasks 20 --tasks-per-step 20 --support 2 --query 2"
+    ),
+    "demonstration-40-goals": "--maml off --base-tasks 40",
+    "demonstration-80-goals": "--maml off --base-tasks 80",
+    "demonstration-320-goals": "--maml off --base-tasks 320",
 }
-# As many windows a step as "demonstration" has, 80, of fewer or more goals than its 160
-NUMBERS_OF_GOALS = {
-    "demonstration-5-goals": "--base-tasks 5 --tasks-per-step 5 --support 8 --query 8",
-    "demonstration-20-goals": "--base-tasks 20 --tasks-per-step 20 --support 2 --query 2",
-    "demonstration-40-goals": "--base-tasks 40",
-    "demonstration-80-goals": "--base-tasks 80",
-    "demonstration-320-goals": "--base-tasks 320",
-}
-for variant, flags in NUMBERS_OF_GOALS.items():
-    HIDDEN_METHOD[variant] = f"--maml off {flags}"
+NUMBERS_OF_GOALS = tuple(f"demonstration-{n}-goals" for n in (5, 20, 40, 80, 320))
 ADAPTED = ("inner", "inner-first-order")
 MULTI_TASK = ("neither", "neither-as-long")
 READERS = ("demonstration", "demonstration-twice-the-rate")
@@ -163,8 +162,8 @@ def hidden_reports() -> dict[str, tuple[str, Sequence[str]]]:
         reports[f"{steps}-steps"] = (adapted, (*ADAPTED, "both"))
         reports[f"{steps}-steps-best-rate"] = (f"{adapted} --inner-lr {rate}", MULTI_TASK)
     by_adamw = "finetune.py --task novel --checkpoint {run} --curve 1 5 20"
-    adapted = (*READERS, "both", *ADAPTED, *MULTI_TASK)
-    reports["adamw"] = (by_adamw, adapted)  # the last, since it takes longest
+    arms = (*READERS, "both", *ADAPTED, *MULTI_TASK)
+    reports["adamw"] = (by_adamw, arms)  # the last, since it takes longest
     return reports
 
 

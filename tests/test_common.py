@@ -79,6 +79,13 @@ def test_an_unknown_name_suggests_the_nearest_right_one():
         common.choose("0", ["push", "reach"], "task")
 
 
+def test_a_setting_that_differs_from_its_default_shows_it_also_where_that_is_none(capsys):
+    common.print_settings({"goals": 20, "rate": 0.1, "new": 1}, {"goals": None, "rate": 0.1})
+    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines()[2:]]
+    shown = [[cell.strip() for cell in row] for row in rows]
+    assert shown == [["goals", "20", "None"], ["rate", "0.1", ""], ["new", "1", ""]]
+
+
 def test_a_table_is_markdown_with_aligned_columns():
     table = common.format_table([["task", "%"], ["reach", 100.0]])
     assert table == "| task  | %     |\n| ----- | ----- |\n| reach | 100.0 |"

@@ -374,7 +374,8 @@ def rewrite(path, rows=None, **changes):
     table = pyarrow.parquet.read_table(path)
     table = table if rows is None else table.take(list(rows))
     columns = table.to_pydict()
-    columns |= {name: change(columns[name]) for name, change in changes.items()}
+    for name, change in changes.items():
+        columns[name] = change(columns[name])
     write_table(columns, path)
 
 
@@ -721,8 +722,14 @@ def write_video(path, pictures, *, codec, stored_as, given_as, options):
 
 
 QUANTIZER = {"depth_min": 0.01, "depth_max": 10.0, "shift": 3.5, "use_log": True}
-DEPTH_INFO = {"is_depth_map": True, "depth_unit": "mm"}
-DEPTH_INFO |= {f"video.{name}": value for name, value in QUANTIZER.items()}
+DEPTH_INFO = {
+    "is_depth_map": True,
+    "depth_unit": "mm",
+    "video.depth_min": QUANTIZER["depth_min"],
+    "video.depth_max": QUANTIZER["depth_max"],
+    "video.shift": QUANTIZER["shift"],
+    "video.use_log": QUANTIZER["use_log"],
+}
 
 
 def lerobots_codes(metres):
@@ -758,13 +765,26 @@ def depth_video(info=DEPTH_INFO, stored_as="gray12le", version="v3.0"):
     codes = lerobots_codes(depth)
     if stored_as != "gray12le":
         codes = (codes >> 4).astype(np.uint8)
-    lossless = {"x265-params": "lossless=1:log-level=none"}
-    encoding = {"codec": "libx265", "stored_as": stored_as, "options": lossless}
-    place = write_videos(SEEN, version, codes, given_as=stored_as, **encoding)
+    place = write_videos(
+        SEEN,
+        version,
+        codes,
+        given_as=stored_as,
+        codec="libx265",
+        stored_as=stored_as,
+        options={"x265-params": "lossless=1:log-level=none"},
+    )
     color = np.full((20, 48, 64, 3), [200, 100, 0], np.uint8)
-    encoding = {"codec": "libx264", "stored_as": "yuv420p", "options": {"crf": "1"}}
-    place |= write_videos(COLOR, version, color, given_as="rgb24", **encoding)
-    table = {"episode_index": [0, 1, 2], "length": LENGTHS} | place
+    place_of_color = write_videos(
+        COLOR,
+        version,
+        color,
+        given_as="rgb24",
+        codec="libx264",
+        stored_as="yuv420p",
+        options={"crf": "1"},
+    )
+    table = {"episode_index": [0, 1, 2], "length": LENGTHS, **place, **place_of_color}
     if version == "v3.0":
         write_table(table, "kitchen/meta/episodes/chunk-000/file-000.parquet")
     features = {
@@ -886,7 +906,8 @@ def robomimic(path, seen="pointcloud", **changes):
                 "obs/robot0_gripper_qpos": RNG.normal(size=(T, 2)),
                 f"obs/{seen}": RNG.uniform(0.1, 1, (T, 30, 3)),
             }
-            arrays |= {key: change(T) for key, change in changes.items()}
+            for key, change in changes.items():
+                arrays[key] = change(T)
             group = data.create_group(name)
             group.attrs["num_samples"] = T
             for key, value in arrays.items():
@@ -953,8 +974,8 @@ def test_the_unit_of_depth_may_be_an_attribute_of_it(unit, message, capsys):
 def test_the_instruction_of_libero_is_read():
     robomimic("demo.hdf5")
     with h5py.File("demo.hdf5", "a") as file:
-        said = json.dumps({"language_instruction": "open the drawer"})
-        file["data"].attrs["problem_info"] = said
+        problem = {"language_instruction": "open the drawer"}
+        file["data"].attrs["problem_info"] = json.dumps(problem)
     convert.main(["--import", "demo.hdf5"])
     found = load_demonstrations("recordings/open-the-drawer.npz")
     assert found.instruction == "open the drawer"
@@ -970,8 +991,8 @@ def maniskill(path, seen):
         group["obs/extra/tcp_pose"] = RNG.normal(size=(T + 1, 7)).astype(np.float32)
         for name, value in seen.items():
             group[f"obs/{name}"] = np.repeat(np.asarray(value)[None], T + 1, axis=0)
-    about = {"episodes": [{"episode_id": 0, "elapsed_steps": T}]}
-    Path(path).with_suffix(".json").write_text(json.dumps(about))
+    lengths = {"episodes": [{"episode_id": 0, "elapsed_steps": T}]}
+    Path(path).with_suffix(".json").write_text(json.dumps(lengths))
 
 
 def test_depth_of_maniskill_is_seen_by_its_own_camera():

@@ -475,6 +475,13 @@ def test_what_looks_wrong_is_said_in_one_line(fault, message):
     assert re.search(message, line) and "\n" not in line
 
 
+def test_an_end_that_is_suspected_twice_is_counted_once():
+    wrong = moved_hand(episodes=2)
+    wrong.state[38] += 10  # there and back again, one and two frames before the first episode ends
+    (line,) = data.suspect_episode_ends(wrong)
+    assert "(1 such ends in all)" in line
+
+
 # ---- Windows -------------------------------------------------------------------------------------
 
 

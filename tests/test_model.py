@@ -117,6 +117,7 @@ def sample(policy, batch, seed=0):
         ({"u2t_layers": 100}, ("u2t_layers", "100", "99")),
         ({"timestep_dim": 31}, ("timestep_dim", "31", "even")),
         ({"tcfm": "left"}, ("left", "mid")),
+        ({"tcfm": "up", "unet_widths": (512,)}, ("tcfm", "up", "(512,)")),
     ],
 )
 def test_a_config_that_contradicts_itself_is_refused_naming_both_values(changes, numbers):

@@ -150,6 +150,16 @@ def test_a_step_improves_the_loss_and_keeps_to_the_divergence(adapted):
     assert told_kl == pytest.approx(kl)
 
 
+def test_a_step_into_nothing_is_no_error_but_is_not_taken(adapted):
+    """A deviation that becomes 0, or a mean that is NaN: the line search shortens such a step."""
+    policies, params, _, _ = adapted
+    old = policies.gaussians(params)
+    for name, value in (("log_std", -1e4), ("mean.4.bias", float("nan"))):
+        candidate = {**params, name: torch.full_like(params[name], value)}
+        loss, kl = policies.surrogate_loss_and_kl(candidate, old)
+        assert not (np.isfinite(loss) and kl <= 0.02)
+
+
 # ---- Advantages ----------------------------------------------------------------------------------
 
 

@@ -24,6 +24,7 @@ import rlbench_env
 import simulator
 from data import RecordingError, load_demonstrations
 from model import PRESETS
+from robot import SAMPLED_FROM
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 RNG = np.random.default_rng(0)
@@ -112,7 +113,7 @@ def test_a_cloud_is_of_all_cameras_inside_of_the_workspace():
     points = rlbench_data.seen_points(views)
     low, high = rlbench_data.WORKSPACE
     assert (points >= low).all() and (points <= high).all()
-    assert 1000 < len(points) <= 8192 and points.dtype == np.float32
+    assert 1000 < len(points) <= SAMPLED_FROM and points.dtype == np.float32
     of_one = [set(map(tuple, view.points())) for view in views]
     assert all(len(seen & set(map(tuple, points))) > 300 for seen in of_one)
     narrow = rlbench_data.seen_points(views, [[0.2, 0, 0.8], [0.3, 0.1, 1.0]])

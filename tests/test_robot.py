@@ -828,7 +828,7 @@ def test_a_program_that_does_not_end_is_told(emulator, settings, capsys):
     assert "does not end: stop it by hand" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(4))
 def test_no_script_of_faults_makes_the_arm_faster_than_allowed(seed):
     fastest, limits, _ = fuzz_robot(seed)
     assert fastest[0] <= limits[0] and fastest[1] <= limits[1]

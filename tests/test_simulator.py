@@ -171,6 +171,25 @@ def test_failed_attempts_are_not_kept_but_counted(tmp_path):
     assert recorded.meta["expert_success_rate"] == 0.5
 
 
+class BlindEnvironment(ToyEnvironment):
+    """Nothing is seen in the middle of episodes of even seeds."""
+
+    def begin(self, seed):
+        super().begin(seed)
+        self.blind_at = 5 if seed % 2 == 0 else None
+
+    def observe(self):
+        if self.steps == self.blind_at:
+            raise simulator.OutOfSightError("nothing is seen")
+        return super().observe()
+
+
+def test_an_attempt_in_which_nothing_is_seen_has_failed():
+    env = BlindEnvironment(None, num_points=64, episode_steps=12)
+    assert simulator.record_episode(env, seed=4) is None
+    assert simulator.record_episode(env, seed=5) is not None
+
+
 def test_an_expert_that_hardly_ever_succeeds_is_given_up(tmp_path):
     with pytest.raises(UserError, match="touch-red: the expert succeeded in 1 of 40 episodes; try"):
         collect(HardSimulator(every=30), [TASK], tmp_path, episodes=2, workers=1)

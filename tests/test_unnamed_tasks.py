@@ -337,9 +337,8 @@ def test_the_queue_shows_each_task_the_demonstration_of_one_that_contradicts_it(
         assert set(variants) <= set(plan.variants)
         if "--swap demonstration" in command:
             tasks = re.search(r"--task (.*?) --", command)[1].split()
-            shown = evaluate.of_next_task(
-                dict(zip(tasks, tasks))
-            )  # task -> whose demonstration it is shown
+            # task -> the one whose demonstration it is shown
+            shown = evaluate.of_next_task(dict(zip(tasks, tasks)))
             named += tasks
             for task, other in shown.items():
                 if suite == "pairs":
