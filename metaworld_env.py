@@ -100,8 +100,10 @@ RENDER_PIXELS = 240
 WORKSPACE = ((-0.55, 0.3, -0.05), (0.6, 1.0, 0.48))  # the table and its holes, below the upper arm
 NUM_POINTS = 512
 EPISODE_STEPS = 200
-FINGERTIP_TASKS = ("reach", "reach-wall")  # won by bringing the fingertips to the goal
+# Won by bringing the fingertips, or what they hold, to the goal.
+FINGERTIP_TASKS = ("reach", "reach-wall", "pick-place", "pick-place-wall")
 REST_AFTER = 20  # after so many steps of success in a row the expert rests
+REST_GAIN = 10.0  # of a resting hand, action per metre; that of most experts
 
 # How recordings are made. One that was made in another way is refused by `simulator.collect`.
 RECIPE = {
@@ -111,8 +113,9 @@ RECIPE = {
     "workspace": [list(corner) for corner in WORKSPACE],
     "num_points": NUM_POINTS,
     "sampling": "farthest points",
-    "expert": "Meta-World's, with the fingertips at the goal of reach and reach-wall",
+    "expert": "Meta-World's, with the fingertips at the goal of reach and pick-place",
     "rests_after": REST_AFTER,
+    "rests": "where the hand is then",
     "positions_in_state": 3,  # hand and fingers; actions begin with a displacement of the hand
 }
 
@@ -156,6 +159,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         self.episode_steps = episode_steps
         self.steps = 0  # since the beginning of the episode
         self.successes_in_a_row = 0  # up to the present moment
+        self.resting_place: np.ndarray | None = None  # (3,) of the hand, where the expert rests
         self.gripper = 0.0  # the last number of the last action
 
         sawyer_env = make_sawyer_env(task)
@@ -224,6 +228,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         mujoco.mj_forward(self.sawyer_env.model, self.sawyer_env.data)
         self.steps = 0
         self.successes_in_a_row = 0
+        self.resting_place = None
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
         """Takes one step: `advance`, then `observe`."""
@@ -241,16 +246,23 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         self.steps += 1
         self.successes_in_a_row = self.successes_in_a_row + 1 if info["success"] else 0
         self.gripper = float(action[3])
+        if self.rest_after is None or self.successes_in_a_row < self.rest_after:
+            self.resting_place = None
+        elif self.resting_place is None:
+            self.resting_place = self.hand()
         truncated = self.steps >= self.episode_steps
         return float(reward), truncated, {"success": bool(info["success"])}
+
+    def hand(self) -> np.ndarray:
+        """Returns the position of the hand (3,), world frame, metres."""
+        return self.sawyer_env.data.body("hand").xpos.copy()
 
     def observe(self) -> dict[str, np.ndarray]:
         """Casts the rays and returns the observation of the present moment."""
         data = self.sawyer_env.data
-        hand = data.body("hand").xpos
         right_finger = data.site("rightEndEffector").xpos
         left_finger = data.site("leftEndEffector").xpos
-        positions = np.concatenate([hand, right_finger, left_finger])  # (9,)
+        positions = np.concatenate([self.hand(), right_finger, left_finger])  # (9,)
         return {"point_cloud": self.cloud(), "agent_pos": positions.astype(np.float32)}
 
     def state_without_goal(self) -> np.ndarray:
@@ -278,20 +290,25 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
     def expert_action(self) -> np.ndarray:
         """Returns the scripted expert's action (4,) float32 in [-1, 1] for the present moment.
 
-        After `rest_after` steps of success in a row it rests: the hand stays where it is, and the
-        gripper as it is. Meta-World's experts go on, and some undo what they did: that of door-open
-        lets the door go, and that of window-open pushes to and fro.
+        After `rest_after` steps of success in a row it rests: it keeps the hand where it is then,
+        and the gripper as it is. Meta-World's experts go on, and some undo what they did: that of
+        door-open lets the door go, and that of window-open pushes to and fro. To keep the hand in
+        its place takes small actions. An action of zero is no rest: the simulator's arm follows a
+        target that actions move, and where it lags behind, as it does with a puck in its grip, it
+        goes on for centimetres.
 
-        Reach is a success where the fingertips are within 5 cm of the goal, but Meta-World's expert
-        brings the hand there, which is 4.5 cm above them: half a centimetre lower would be a
-        failure. It is therefore told a goal that is as much higher.
+        Reach is a success where the fingertips are within 5 cm of the goal, and pick-place where
+        the puck between them is within 7 cm. But Meta-World's experts bring the hand there, which
+        is 4.5 cm above the fingertips: what is left is half a centimetre in reach, and 2.5 cm in
+        pick-place. They are therefore told a goal that is as much higher.
         """
-        if self.rest_after is not None and self.successes_in_a_row >= self.rest_after:
-            return np.array([0, 0, 0, self.gripper], dtype=np.float32)
+        if self.resting_place is not None:
+            move = REST_GAIN * (self.resting_place - self.hand())
+            return np.clip(np.append(move, self.gripper), -1, 1).astype(np.float32)
         observation = self.expert_observation.copy()
         if self.expert_brings_fingertips:
-            hand = self.sawyer_env.data.body("hand").xpos
-            observation[-3:] += hand - self.sawyer_env.tcp_center  # the last three are the goal
+            # The last three numbers are the goal.
+            observation[-3:] += self.hand() - self.sawyer_env.tcp_center
         return np.clip(self.expert.get_action(observation), -1, 1).astype(np.float32)
 
     def render(self) -> np.ndarray:

@@ -97,6 +97,18 @@ def test_the_expert_of_reach_brings_the_fingertips_to_the_goal(task):
         assert info["success"] and away < 0.02  # Meta-World's own ends 4.5 cm away, and 5 is lost
 
 
+@pytest.mark.parametrize("task", ["pick-place", "pick-place-wall"])
+def test_the_expert_of_pick_place_brings_the_puck_to_the_goal(task):
+    env = MetaWorldPointCloudEnv(task)
+    for seed in range(3):
+        env.begin(seed)
+        for _ in range(env.episode_steps):
+            _, _, info = env.advance(env.expert_action())
+        puck = env.expert_observation[4:7]
+        away = np.linalg.norm(puck - env.sawyer_env._target_pos)
+        assert info["success"] and away < 0.035  # half of the 7 cm that count as success
+
+
 def test_the_expert_of_door_open_rests_where_metaworlds_own_lets_the_door_go():
     successes = {}  # rest_after -> those of each step
     for rest_after in (metaworld_env.REST_AFTER, None):
@@ -112,11 +124,27 @@ def test_the_expert_of_door_open_rests_where_metaworlds_own_lets_the_door_go():
             rests = succeeds + rest_after
             actions = np.array(taken)
             assert all(successes[rest_after][succeeds:])
-            assert np.any(actions[rests - 1, :3]) and not np.any(actions[rests:, :3])
+            assert np.abs(actions[rests - 1, :3]).max() > 0.1
+            assert np.abs(actions[-50:, :3]).max() < 0.1
             np.testing.assert_array_equal(actions[rests:, 3], actions[rests - 1, 3])
             env.begin(0)
             np.testing.assert_array_equal(env.expert_action(), taken[0])  # it rests no longer
     assert any(successes[None]) and not successes[None][-1]
+
+
+def test_an_expert_at_rest_stays_where_it_is_and_an_action_of_zero_would_not():
+    moved = {}  # how far from where it began to rest, in metres
+    for resting in (True, False):
+        env = MetaWorldPointCloudEnv("push")
+        env.begin(0)
+        while env.resting_place is None:
+            env.advance(env.expert_action())
+        place = env.hand()
+        for _ in range(100):
+            still = np.array([0, 0, 0, env.gripper])
+            env.advance(env.expert_action() if resting else still)
+        moved[resting] = np.linalg.norm(env.hand() - place)
+    assert moved[True] < 0.002 and moved[False] > 5 * moved[True]
 
 
 def test_the_goal_marker_is_in_the_cloud(reach):
