@@ -637,9 +637,7 @@ demo_encoders["mlp"] = DemonstrationMLP
 
 def without_task(preset: str, **changes: Any) -> PolicyConfig:
     """DAMI's preset of a name with `changes`, for a policy that reads no task."""
-    return replace(
-        model.PRESETS[preset], demo_encoder="none", tcfm="none", action_error="squared", **changes
-    )
+    return replace(model.PRESETS[preset], demo_encoder="none", tcfm="none", **changes)
 
 
 # The configurations by policy and preset. `paper`: as the published code is run; `small`: about

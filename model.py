@@ -923,7 +923,6 @@ PRESETS = {
         num_points=128, pointnet_widths=(32, 64, 128), state_feature_dim=32, timestep_dim=64,
         demo_stride=16, demo_positions=13,  # 13 of a demonstration's 200 frames
         unet_widths=(32, 64, 128), n_action_steps=4, inference_steps=5,
-        action_error="huber",
     ),
     "tiny": PolicyConfig(
         num_points=64, pointnet_widths=(16, 32), point_feature_dim=16, state_feature_dim=16,

@@ -929,12 +929,10 @@ def own_recordings(folder: Path) -> dict[str, Path]:
     return paths
 
 
-def choose_architecture(args: argparse.Namespace, preset: str, suite: str) -> PolicyConfig:
-    """The preset's architecture on a suite, with the flags that were given."""
+def choose_architecture(args: argparse.Namespace, preset: str) -> PolicyConfig:
+    """The preset's architecture, with the flags that were given."""
     flags = {name: getattr(args, name) for name in ARCHITECTURE}
     config = baselines.PRESETS[args.policy or "dami"][preset]
-    if suite.removesuffix("-validation") in SUITE_SETTINGS:  # "huber" was never measured there
-        config = replace(config, action_error="squared")
     try:
         config = replace(config, **{name: x for name, x in flags.items() if x is not None})
         model.POLICIES[config.policy].check_config(config)
@@ -1202,7 +1200,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     preset = choose(args.preset or default, SETTINGS, "preset")
     own = args.data is not None and args.suite is None
     suite = "own" if own else args.suite or "ml10"
-    config = choose_architecture(args, preset, suite)
+    config = choose_architecture(args, preset)
 
     # Own recordings, or the base tasks of a suite
     if own:

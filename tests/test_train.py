@@ -617,19 +617,19 @@ def test_every_way_of_training_learns_something_of_its_own(pair, tmp_path):
 
 def dropout_settings(options):
     args = train.parse(["--preset", "small", *options.split()])
-    config = train.choose_architecture(args, "small", "ml10")
+    config = train.choose_architecture(args, "small")
     settings = train.choose_settings(args, "small", "ml10", config)
     return settings.instruction_dropout, settings.task_dropout
 
 
-def test_the_error_of_small_is_squared_where_another_was_not_measured():
-    def error(options, suite="ml10"):
-        return train.choose_architecture(train.parse(options.split()), "small", suite).action_error
+def test_the_error_is_squared_unless_another_is_asked_for():
+    def error(options):
+        return train.choose_architecture(train.parse(options.split()), "small").action_error
 
-    assert error("") == error("", "own") == "huber"
-    assert error("", "goals-reach") == error("", "goals-push-validation") == "squared"
-    assert error("--action-error huber", "pairs") == "huber"
-    assert error("--policy dp3") == error("--policy mamba") == "squared"
+    assert error("") == error("--policy dp3") == error("--policy mamba") == "squared"
+    assert error("--action-error huber") == "huber"
+    with pytest.raises(common.UserError, match="needs action_error 'squared'"):
+        error("--policy dp3 --action-error huber")
 
 
 def test_a_policy_that_reads_no_demonstration_keeps_its_instruction():
