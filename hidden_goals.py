@@ -57,7 +57,6 @@ SMALL_RECIPE = {
     "num_points": NUM_POINTS,
     "success": "at the end",
     "rests_after": None,  # the expert needs no rest for that
-    "rests": None,
 }
 
 # What pictures are drawn from, which show the goal.

@@ -103,7 +103,7 @@ EPISODE_STEPS = 200
 # Won by bringing the fingertips, or what they hold, to the goal.
 FINGERTIP_TASKS = ("reach", "reach-wall", "pick-place", "pick-place-wall")
 REST_AFTER = 20  # after so many steps of success in a row the expert rests
-REST_GAIN = 10.0  # of a resting hand, action per metre; that of most experts
+REST_GAIN = 10.0  # of a resting hand, action per metre, as of the experts of push and pick-place
 
 # How recordings are made. One that was made in another way is refused by `simulator.collect`.
 RECIPE = {
@@ -115,7 +115,6 @@ RECIPE = {
     "sampling": "farthest points",
     "expert": "Meta-World's, with the fingertips at the goal of reach and pick-place",
     "rests_after": REST_AFTER,
-    "rests": "where the hand is then",
     "positions_in_state": 3,  # hand and fingers; actions begin with a displacement of the hand
 }
 
@@ -295,7 +294,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         door-open lets the door go, and that of window-open pushes to and fro. To keep the hand in
         its place takes small actions. An action of zero is no rest: the simulator's arm follows a
         target that actions move, and where it lags behind, as it does with a puck in its grip, it
-        goes on for centimetres.
+        goes on for a centimetre and more.
 
         Reach is a success where the fingertips are within 5 cm of the goal, and pick-place where
         the puck between them is within 7 cm. But Meta-World's experts bring the hand there, which
@@ -303,8 +302,9 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         pick-place. They are therefore told a goal that is as much higher.
         """
         if self.resting_place is not None:
-            move = REST_GAIN * (self.resting_place - self.hand())
-            return np.clip(np.append(move, self.gripper), -1, 1).astype(np.float32)
+            displacement = REST_GAIN * (self.resting_place - self.hand())
+            action = np.append(displacement, self.gripper)
+            return np.clip(action, -1, 1).astype(np.float32)
         observation = self.expert_observation.copy()
         if self.expert_brings_fingertips:
             # The last three numbers are the goal.

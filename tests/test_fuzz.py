@@ -131,7 +131,11 @@ def test_shapes_that_would_broadcast_are_refused(changes):
     shapes = {"points": (2, 2, 8, 3), "state": (2, 2, 9), "action": (2, 16, 4), "noise": (2, 16, 4)}
     batch = {name: torch.zeros(shape) for name, shape in (shapes | changes).items()}
     batch["timesteps"] = torch.zeros(changes.get("timesteps", (2,)), dtype=torch.int64)
-    task = {"text": torch.zeros(1, 512), "demo_points": torch.zeros(1, 3, 8, 3)}
-    task |= {"demo_state": torch.zeros(1, 3, 9), "demo_action": torch.zeros(1, 3, 4)}
+    task = {
+        "text": torch.zeros(1, 512),
+        "demo_points": torch.zeros(1, 3, 8, 3),
+        "demo_state": torch.zeros(1, 3, 9),
+        "demo_action": torch.zeros(1, 3, 4),
+    }
     with pytest.raises(ValueError, match=next(iter(changes))):
         policy.loss(**batch, **task)

@@ -284,11 +284,10 @@ def test_the_shared_key_path_of_u2t_equals_the_full_sequence_with_its_gradients(
     tokens = u2t.embed(demo, text).repeat_interleave(windows // tasks, dim=0)
     naive = u2t.blocks[0](torch.cat([tokens, h[:, None]], dim=1))[:, -1]
     torch.testing.assert_close(fused, naive, atol=1e-6, rtol=0)
-    both = [
-        torch.autograd.grad((x * weights).sum(), [*inputs, *u2t.parameters()])
-        for x in (fused, naive)
-    ]
-    for shared, full in zip(*both):
+    leaves = [*inputs, *u2t.parameters()]
+    of_fused = torch.autograd.grad((fused * weights).sum(), leaves)
+    of_naive = torch.autograd.grad((naive * weights).sum(), leaves)
+    for shared, full in zip(of_fused, of_naive):
         assert full.abs().max() > 0
         torch.testing.assert_close(shared, full, atol=1e-6, rtol=0)
 
