@@ -4,8 +4,9 @@
     python train.py --policy mamba --maml off           # multi-task training instead of MAML
     python baselines.py                                 # the size of each policy and preset
 
-`dp3` is model.py's policy without demonstration and instruction. The other three see what it sees,
-two observations, and each changes one thing:
+`dp3` is model.py's policy without demonstration and instruction. The other three, too, read two
+observations and nothing else. What each of them changes (`flow` and `mamba` also draw as few
+actions as their code does):
 
     flow    FlowPolicy: what is learned. A velocity from noise to actions, consistent along its way,
             so that one step draws them.
@@ -140,8 +141,6 @@ class FlowPolicy(DP3Policy):
         r_before_s = s - t > 1.01 * self.STEP  # r < s, with a margin for rounding
         distance = (f_t - f_r) ** 2 + self.WEIGHT * r_before_s * (v_t - v_r) ** 2  # (B, H, A)
         return distance.mean() / self.STEP**2
-
-    forward = loss
 
     def velocity(self, x: Tensor, t: Tensor, observation: Tensor) -> Tensor:
         """x (B, H, A), t (B,), observation (B, To * feature) -> v (B, H, A)."""
@@ -353,8 +352,6 @@ class MambaPolicy(DP3Policy):
         prediction = self.denoiser(noisy, h, drop_path=drop_path.to(h.dtype))  # (B, H, A)
         return F.mse_loss(prediction, clean)
 
-    forward = loss
-
 
 # ---- FreqPolicy ----------------------------------------------------------------------------------
 
@@ -530,8 +527,10 @@ class FreqPolicy(DP3Policy):
         noise = draw(torch.randn, n, H, A, like=self.normalizer.action_scale, generator=generator)
         timesteps = (K * uniform(n, H)).long().clamp(max=K - 1)
         cutoffs = ((H + 1) * uniform(n)).long().clamp(max=H)
-        z = torch.tensor((self.LEAST_HIDDEN - 1) / self.DEVIATION, device=noise.device)
-        below = torch.special.ndtr(z)  # the distribution function runs from here to 1 / 2
+        # The normal distribution around 1, cut to [LEAST_HIDDEN, 1], by the inverse of its
+        # distribution function, which is `below` at the lower end and 1 / 2 at the upper one.
+        lowest = torch.tensor((self.LEAST_HIDDEN - 1) / self.DEVIATION, device=noise.device)
+        below = torch.special.ndtr(lowest)
         quantile = below + (0.5 - below) * uniform(n)
         share = 1 + self.DEVIATION * torch.special.ndtri(quantile)  # (n,)
         rank = uniform(n, H).argsort(dim=1)  # (n, H)
@@ -578,8 +577,6 @@ class FreqPolicy(DP3Policy):
         low = self.denoiser.low_pass(clean, cutoffs)  # (B, H, A)
         z = self.denoiser(observation, low, mask, cutoffs)  # (B, H, W)
         return F.mse_loss(self.denoiser.head(noisy, timesteps, z, cutoffs), noise)
-
-    forward = loss
 
     @torch.no_grad()
     def sample_actions(
@@ -635,58 +632,38 @@ denoisers["frequency-transformer"] = FrequencyTransformer
 demo_encoders["mlp"] = DemonstrationMLP
 
 
-def without_task(preset: str, **changes: Any) -> PolicyConfig:
-    """DAMI's preset of a name with `changes`, for a policy that reads no task."""
-    return replace(model.PRESETS[preset], demo_encoder="none", tcfm="none", **changes)
+def preset(policy: str, size: str, **changes: Any) -> PolicyConfig:
+    """DAMI's preset of a size, with what a policy requires of its configuration, and `changes`."""
+    required = POLICIES[policy].requires
+    return replace(model.PRESETS[size], policy=policy, **required, **changes)
 
 
 # The configurations by policy and preset. `paper`: as the published code is run; `small`: about
 # 3 million parameters, as many as DAMI's.
-# fmt: off
+SHORT = {"horizon": 4, "n_action_steps": 3}  # the chunks of FlowPolicy and Mamba Policy
 PRESETS = {
     "dami": model.PRESETS,
     "dp3": {
-        "paper": without_task("paper", policy="dp3"),
-        "small": without_task("small", policy="dp3", unet_widths=(48, 96, 192)),
-        "tiny": without_task("tiny", policy="dp3"),
+        "paper": preset("dp3", "paper"),
+        "small": preset("dp3", "small", unet_widths=(48, 96, 192)),
+        "tiny": preset("dp3", "tiny"),
     },
     "flow": {
-        "paper": without_task("paper", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
-        "small": without_task(
-            "small", policy="flow", sampler="ddim", horizon=4, n_action_steps=3,
-            unet_widths=(48, 96, 192),
-        ),
-        "tiny": without_task("tiny", policy="flow", sampler="ddim", horizon=4, n_action_steps=3),
+        "paper": preset("flow", "paper", **SHORT),
+        "small": preset("flow", "small", **SHORT, unet_widths=(48, 96, 192)),
+        "tiny": preset("flow", "tiny", **SHORT),
     },
     "mamba": {
-        "paper": without_task(
-            "paper", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3,
-            unet_widths=(128, 256, 512),
-        ),
-        "small": without_task(
-            "small", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3,
-            unet_widths=(32, 64, 112),
-        ),
-        "tiny": without_task(
-            "tiny", policy="mamba", denoiser="mamba-unet", horizon=4, n_action_steps=3
-        ),
+        "paper": preset("mamba", "paper", **SHORT, unet_widths=(128, 256, 512)),
+        "small": preset("mamba", "small", **SHORT, unet_widths=(32, 64, 112)),
+        "tiny": preset("mamba", "tiny", **SHORT),
     },
     "freq": {
-        "paper": without_task(
-            "paper", policy="freq", denoiser="frequency-transformer", sampler="ddim",
-            unet_widths=(512, 1024),
-        ),
-        "small": without_task(
-            "small", policy="freq", denoiser="frequency-transformer", sampler="ddim",
-            unet_widths=(128, 256),
-        ),
-        "tiny": without_task(
-            "tiny", policy="freq", denoiser="frequency-transformer", sampler="ddim",
-            unet_widths=(32, 64),
-        ),
+        "paper": preset("freq", "paper", unet_widths=(512, 1024)),
+        "small": preset("freq", "small", unet_widths=(128, 256)),
+        "tiny": preset("freq", "tiny", unet_widths=(32, 64)),
     },
 }
-# fmt: on
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ PROJECTION = "cam_projection" if hasattr(mujoco.MjModel, "cam_projection") else 
 def drawn_colors(model: mujoco.MjModel, kind: str, groups: Sequence[int]) -> np.ndarray:
     """Returns the RGBA (n, 4) in [0, 1] in which MuJoCo draws the n objects of a kind.
 
-    The color of a texture is its mean. What is not drawn has alpha 0.
+    The color of a texture is the mean of every 16th texel. What is not drawn has alpha 0.
 
     Args:
         kind: "geom", "site", "flex" or "skin".
@@ -48,6 +48,7 @@ def drawn_colors(model: mujoco.MjModel, kind: str, groups: Sequence[int]) -> np.
             textures[index] = texels[::16, :3].mean(axis=0) / 255
 
     colors = rgba.astype(np.float64)
+    # This is MuJoCo's default; where there is a material, that has the color.
     undefined = (rgba == (0.5, 0.5, 0.5, 1)).all(axis=1) & (material >= 0)
     colors[undefined] = model.mat_rgba[material[undefined]]
     colors[:, :3] *= textures[material]
@@ -140,10 +141,10 @@ class RayCastCamera:
             raise ValueError(f"the box is empty: its low corner is {box[0]}, its high one {box[1]}")
 
         # Where the camera is and how wide it sees.
-        named = camera is not None
-        if named != (position is None) or named != (lookat is None):
+        given = [x is not None for x in (camera, position, lookat)]
+        if given not in ([True, False, False], [False, True, True]):
             raise ValueError("give either a camera of the model, or a position and a lookat")
-        if not named:
+        if camera is None:
             self.camera, self.free_pose = None, look_at(position, lookat)
             fovy, orthographic = model.vis.global_.fovy, model.vis.global_.orthographic
         else:

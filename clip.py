@@ -320,7 +320,10 @@ def read_clip_file(path: Path) -> CLIPTextEncoder:
     if like_zip and not zipfile.is_zipfile(path):  # a zip's table of contents stands at its end
         size = path.stat().st_size
         raise TextWeightsError(f"{path}: the file is cut off after {size} bytes; fetch it again")
-    names = zipfile.ZipFile(path).namelist() if like_zip else []
+    names = []
+    if like_zip:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
     if any(name.endswith("/constants.pkl") for name in names):
         raise TextWeightsError(
             f"{path}: a TorchScript archive with SHA-256 {sha256[:8]}..., not the official "
@@ -361,7 +364,8 @@ def download_clip(path: Path) -> None:
                 raise OSError(f"the connection ended after {received} of {size} bytes")
             if file_sha256(part) != CLIP_SHA256:
                 raise TextWeightsError(
-                    f"{CLIP_URL}: what arrived has another SHA-256 and was thrown away"
+                    f"{CLIP_URL}: what arrived has another SHA-256 and was thrown away; name a "
+                    "ViT-B-32.pt with --clip-weights, or use --clip-weights random"
                 )
             os.replace(part, path)
 
@@ -447,6 +451,11 @@ def text_features(
         TextWeightsError: the weights that can be had are not those of the checkpoint.
     """
     random_seed = re.fullmatch(r"random-seed-(\d+)", identity or "")
+    if weights is None and (identity or "").startswith("state-dict-"):
+        raise TextWeightsError(
+            f"the checkpoint was made with the text weights {identity!r}: name their file with "
+            "--clip-weights"
+        )
     if random_seed and weights in (None, "random"):
         encoder = load_clip_text_encoder("random", seed=int(random_seed[1]))
     else:

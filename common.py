@@ -78,12 +78,18 @@ def add_settings(parser: Any, settings_class: type, presets: dict[str, Any] | No
             continue
         values = {name: getattr(preset, f.name) for name, preset in (presets or {}).items()}
         help = f.metadata["help"] + describe_presets(values)
-        kind = next((t for t in get_args(f.type) if t is not type(None)), f.type)  # int | None
+        kind = without_none(f.type)
         if kind is bool:
             parser.add_argument(flag_name(f.name), action=argparse.BooleanOptionalAction, help=help)
         else:
             choices = f.metadata.get("choices")
             parser.add_argument(flag_name(f.name), type=kind, choices=choices, help=help)
+
+
+def without_none(kind: Any) -> type:
+    """The type of a field that may also be None: `int | None` -> `int`."""
+    others = [part for part in get_args(kind) if part is not type(None)]
+    return others[0] if others else kind
 
 
 def describe_presets(values: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@
     python convert.py --import demo.hdf5 --feature obs/front_depth ...     # robomimic, ManiSkill
     python convert.py --import folder/of/dataset --out data                # a data set of RLBench
 
-Each format has one reader (`FORMATS`), which yields frames and says what the source tells about
+Each format has one reader (`reader_of`), which yields frames and says what the source tells about
 itself: how many frames and episodes there must be, and at which rate. `assemble` then does the same
 for all of them: it holds the frames against that, cleans and samples the clouds, and makes a
 recording of each task, as data.py describes it. Who needs zarr, pyarrow, h5py or av installs it.
@@ -62,7 +62,7 @@ from data import (
     suspicions,
 )
 from report import plot_demonstration
-from robot import depth_to_points, thin
+from robot import depth_to_points, has_depth, thin
 
 
 def refuse(path: Any, problem: str) -> NoReturn:
@@ -217,13 +217,11 @@ LENS = "fx, fy, cx, cy"
 POINT_DIMS = range(3, 11)  # numbers a point may have
 
 
-def is_cloud_shape(shape: tuple[int, ...]) -> bool:
-    """Whether an array has one axis of coordinates, the first or the last, and enough points."""
-    return cloud_axis(shape) is not None
-
-
 def cloud_axis(shape: tuple[int, ...]) -> int | None:
-    """The axis of coordinates: -1 for (N, 3) and (H, W, 3), 0 for (3, N) and (3, H, W)."""
+    """The axis of coordinates: -1 for (N, 3) and (H, W, 3), 0 for (3, N) and (3, H, W).
+
+    None for an array that is no cloud: it has no such axis, or too few points.
+    """
     if len(shape) not in (2, 3):
         return None
     for axis in (-1, 0):
@@ -260,7 +258,7 @@ def depth_cloud(
     metres = depth.astype(np.float32) * np.float32(scale)
     points = depth_to_points(metres, intrinsics)
     if color is not None:
-        seen = np.isfinite(metres) & (metres > 0)
+        seen = has_depth(metres)
         points = np.concatenate([points, color[seen].astype(np.float32)], axis=1)
     return points if pose is None else transform(points, pose)
 
@@ -327,7 +325,7 @@ def choose_array(
     def is_depth(name: str) -> bool:
         return name in depth_maps or ("depth" in name and not re.search("point|cloud", name))
 
-    clouds = [n for n in shapes if not is_depth(n) and is_cloud_shape(shapes[n])]
+    clouds = [n for n in shapes if not is_depth(n) and cloud_axis(shapes[n]) is not None]
     depths = [n for n in shapes if is_depth(n) and sum(size > 1 for size in shapes[n]) == 2]
     if chosen in clouds:
         return chosen, False
@@ -336,7 +334,7 @@ def choose_array(
     named = [n for n in clouds if re.search("point|cloud", n)]
     found = named or depths
     if chosen is None and len(found) == 1:
-        return found[0], found == depths
+        return found[0], not named
     there = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
     problem = "name a cloud (N, 3) or depth (H, W) with --feature"
     if chosen is not None:
@@ -415,7 +413,8 @@ def check_zarr(path: Path, arrays: dict[str, Any]) -> None:
     for part, array in arrays.items():
         if getattr(array, "dtype", np.dtype("O")).kind not in "fiu":  # zarr may unpickle objects
             refuse(path, f"{IN_ZARR[part]} must be plain numbers")
-    for part in ("points", "state"):  # zarr fills what is missing with zeros
+    # zarr fills what is missing with zeros. Actions may be zeros, and such chunks are not stored.
+    for part in ("points", "state"):
         chunks = arrays[part].nchunks
         missing = chunks - arrays[part].nchunks_initialized
         if missing > 0:
@@ -614,7 +613,7 @@ class LeRobot:
         rows = []
         meta = self.path / "meta"
         if (meta / "episodes.jsonl").is_file():
-            rows = read_json_lines(meta / "episodes.jsonl")
+            rows = read_all_json_lines(meta / "episodes.jsonl")
         for file in sorted((meta / "episodes").glob("*/*.parquet"), key=natural):
             stored = self.open_parquet(file)
             columns = [n for n in stored.schema_arrow.names if not n.startswith("stats/")]
@@ -632,7 +631,7 @@ class LeRobot:
                 refuse(meta / "tasks.parquet", "lacks task_index or task: add --instruction")
             return dict(zip(index, table[texts[0]]))
         if (meta / "tasks.jsonl").exists():
-            rows = read_json_lines(meta / "tasks.jsonl")
+            rows = read_all_json_lines(meta / "tasks.jsonl")
             return {
                 row["task_index"]: row.get("task")
                 for row in rows
@@ -721,7 +720,7 @@ def natural(file: Path) -> list[int]:
     return [int(number) for number in re.findall(r"\d+", "/".join(file.parts[-2:]))]
 
 
-def read_json_lines(path: Path) -> list[dict[str, Any]]:
+def read_all_json_lines(path: Path) -> list[dict[str, Any]]:
     try:
         return [dict(json.loads(line)) for line in path.read_text().splitlines() if line.strip()]
     except (TypeError, ValueError) as error:
@@ -1098,21 +1097,20 @@ def is_hdf5(path: Path) -> bool:
         return path.suffix in (".h5", ".hdf5") or file.read(8) == b"\x89HDF\r\n\x1a\n"
 
 
-@dataclass(frozen=True)
-class Format:
-    """How a format is recognized, and read."""
-
-    name: str
-    recognize: Callable[[Path], bool]
-    read: Callable[[Path, Options], Source]
+def is_lerobot(path: Path) -> bool:
+    """Whether a folder is a dataset of LeRobot."""
+    return (path / "meta" / "info.json").is_file()
 
 
-FORMATS = (  # the first that recognizes a path reads it
-    Format("LeRobot", lambda path: (path / "meta" / "info.json").is_file(), read_lerobot),
-    Format("HDF5", is_hdf5, read_hdf5),
-    Format("RLBench", rlbench_data.is_data_set, read_rlbench),
-    Format("DP3", lambda path: True, read_zarr),
-)
+def reader_of(path: Path) -> Callable[[Path, Options], Source]:
+    """The function that reads a data set of its format."""
+    if is_lerobot(path):
+        return read_lerobot
+    if is_hdf5(path):
+        return read_hdf5
+    if rlbench_data.is_data_set(path):
+        return read_rlbench
+    return read_zarr
 
 
 # ---- One check for all of them -------------------------------------------------------------------
@@ -1130,6 +1128,11 @@ class Episode:
     states: list[np.ndarray] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)
     left_out: Counter = field(default_factory=Counter)  # what -> how many
+
+
+# What is left out of each point
+BESIDE_POSITION = "numbers beside x, y, z of each point (--color keeps colors)"
+BESIDE_COLOR = "numbers beside position and color of each point"
 
 
 def assemble(
@@ -1274,9 +1277,7 @@ def add_frame(
     if points.shape[1] < kept:
         refuse(path, f"its points have {points.shape[1]} numbers, so no color: leave --color out")
     if extra := points.shape[1] - kept:
-        what = "numbers beside x, y, z of each point (--color keeps colors)"
-        if options.color is not None:
-            what = "numbers beside position and color of each point"
+        what = BESIDE_POSITION if options.color is None else BESIDE_COLOR
         episode.left_out[what] = extra
     if len(points) == 0:
         episode.clouds.append(None)
@@ -1381,8 +1382,7 @@ def import_recordings(args: argparse.Namespace) -> None:
     if not path.exists():
         refuse(path, "is missing: look at --import")
     options = read_options(args)
-    form = next(form for form in FORMATS if form.recognize(path))
-    source = form.read(path, options)
+    source = reader_of(path)(path, options)
     tasks, notes = assemble(
         path, source, options, num_points=args.num_points, incomplete=args.incomplete
     )
@@ -1468,12 +1468,14 @@ def describe(
 
 
 def total_left_out(episodes: list[Episode]) -> Counter:
-    """What was left out of a task: sums, but for the numbers of each point."""
+    """What was left out of a task: a sum, but for the numbers of each point."""
     total: Counter = Counter()
     for episode in episodes:
         for what, count in episode.left_out.items():
-            each = "of each point" in what
-            total[what] = max(total[what], count) if each else total[what] + count
+            if what in (BESIDE_POSITION, BESIDE_COLOR):
+                total[what] = max(total[what], count)
+            else:
+                total[what] += count
     return total
 
 
@@ -1490,13 +1492,15 @@ def check(path: Path) -> None:
     files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
     if not files:
         refuse(path, "holds no recordings (.npz)")
-    count = sum(print_suspicions(file, load_demonstrations(file)) for file in files)
-    print(f"{len(files)} checked, {count or 'nothing'} suspicious")
+    found = sum(print_suspicions(file, load_demonstrations(file)) for file in files)
+    print(f"files checked: {len(files)}, suspicions: {found}")
 
 
 def show(path: str, out: str | None, episode: int) -> None:
     """Draws an episode of a recording."""
-    picture = Path(out or path).with_suffix(".png")
+    picture = Path(out) if out else Path(path).with_suffix(".png")
+    if picture.suffix != ".png":
+        raise UserError(f"--out is {out}: name a .png file")
     recording = load_demonstrations(path)
     if not 0 <= episode < len(recording):
         refuse(path, f"holds episodes 0 to {len(recording) - 1}, not {episode}")

@@ -143,13 +143,21 @@ class Demonstrations:
             raise RecordingError(
                 f"{n} demonstrations of {self.task} asked for, there are {len(self)}"
             )
-        end = self.episode(n - 1).stop
+        return self.part(0, n)
+
+    def part(self, first: int, stop: int) -> "Demonstrations":
+        """Returns the episodes from `first` up to, but without, `stop` (views, no copies)."""
+        start, end = self.episode(first).start, self.episode(stop - 1).stop
+        meta = dict(self.meta)
+        if "success_frames" in meta:
+            meta["success_frames"] = meta["success_frames"][first:stop]
         return replace(
             self,
-            points=self.points[:end],
-            state=self.state[:end],
-            action=self.action[:end],
-            episode_ends=self.episode_ends[:n],
+            points=self.points[start:end],
+            state=self.state[start:end],
+            action=self.action[start:end],
+            episode_ends=self.episode_ends[first:stop] - start,
+            meta=meta,
         )
 
     # -- Checks: each raises RecordingError for what could not be saved, read and trained on
@@ -240,6 +248,8 @@ class Demonstrations:
         """What `meta` says can be written as JSON, and its known entries make sense."""
         meta = {}  # as a file gives it back
         for name, value in self.meta.items():
+            if not isinstance(name, str):
+                raise RecordingError(f"the names in meta must be text, not {name!r}")
             try:
                 meta[name] = json.loads(meta_as_json(value))
             except (TypeError, ValueError) as error:
@@ -286,7 +296,7 @@ class Demonstrations:
         frames = meta["success_frames"]
         if (
             not isinstance(frames, list)
-            or len(frames) < len(self)  # `take` keeps the entries of episodes that it drops
+            or len(frames) != len(self)
             or any(type(frame) is not int or frame < 0 for frame in frames)
         ):
             raise RecordingError(
@@ -328,20 +338,8 @@ def hold_out(
         raise RecordingError(
             f"{demonstrations.task} has {len(demonstrations)} episodes: hold out fewer than that"
         )
-    kept = demonstrations.take(len(demonstrations) - n)
-    start = len(kept.points)
-    meta = dict(demonstrations.meta)
-    if "success_frames" in meta:
-        meta["success_frames"] = meta["success_frames"][len(kept) : len(demonstrations)]
-    heldout = replace(
-        demonstrations,
-        points=demonstrations.points[start:],
-        state=demonstrations.state[start:],
-        action=demonstrations.action[start:],
-        episode_ends=demonstrations.episode_ends[-n:] - start,
-        meta=meta,
-    )
-    return kept, heldout
+    kept = len(demonstrations) - n
+    return demonstrations.part(0, kept), demonstrations.part(kept, len(demonstrations))
 
 
 # ---- Files ---------------------------------------------------------------------------------------
@@ -400,16 +398,20 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     """Reads what `save_demonstrations`, or a recorder of your own, wrote.
 
     Raises RecordingError, in one line, for a file that is missing, damaged, foreign or
-    inconsistent, and OSError for one that may not be read.
+    inconsistent, or that may not be read.
     """
     path = Path(path)
     if not path.is_file():
         raise RecordingError(
             f"{path} is missing: collect it with `python simulator.py`, or record it"
         )
-    with open(path, "rb") as file:
-        if not zipfile.is_zipfile(file):
-            raise RecordingError(f"{path} is truncated or no .npz file: record or collect it again")
+    try:
+        with open(path, "rb") as file:
+            is_archive = zipfile.is_zipfile(file)
+    except PermissionError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    if not is_archive:
+        raise RecordingError(f"{path} is truncated or no .npz file: record or collect it again")
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in FIELDS if name in file.files}
@@ -530,12 +532,14 @@ def suspect_scale(demonstrations: Demonstrations) -> list[str]:
 def suspect_shifted_actions(demonstrations: Demonstrations) -> list[str]:
     """Actions that go with the state's change at another frame better than at their own.
 
-    Action i is compared with the change of state i that follows it; so is its own change, which is
-    what corresponds to it where actions are target positions. Nothing moves before it is told to,
+    An action may be a velocity or a displacement, or else a target position, whose own change from
+    the frame before is then what counts. Both are compared with the change of the state that
+    follows. Nothing moves before it is told to,
     so a negative lag is a mistake. A positive one may be that of the controller, which spreads over
     several frames: only one that is nearly perfect is suspected.
     """
-    margin, actions, changes = max(LAGS), [], {lag: [] for lag in LAGS}
+    margin = max(LAGS)
+    actions, changes = [], {lag: [] for lag in LAGS}
     dims = min(demonstrations.state.shape[1], demonstrations.action.shape[1])
     for index in range(len(demonstrations)):
         frames = demonstrations.episode(index)
@@ -550,7 +554,7 @@ def suspect_shifted_actions(demonstrations: Demonstrations) -> list[str]:
         return []
 
     curves = np.stack([correlation(acted, np.concatenate(changes[lag])) for lag in LAGS])
-    kind = curves.max(axis=0).argmax(axis=0)  # (D,) actions, or their own changes
+    kind = curves.max(axis=0).argmax(axis=0)  # (D,) 0: the action, 1: its change
     curves = curves[:, kind, np.arange(dims)]  # (lags, D)
     related = curves.max(axis=0) > 0.9
     if not related.any():
@@ -646,8 +650,8 @@ def nearest_rotations(a: Tensor) -> Tensor:
 def turn_rotation_vectors(rotvec: Tensor, turn: Tensor, near: Tensor) -> Tensor:
     """Rotation vectors (n, L, 3), then n further rotations (n, 3, 3) -> rotation vectors (n, L, 3).
 
-    By quaternions (w, x, y, z). Of the two vectors of a rotation, angles v and v - 2 pi, the nearer
-    to `near` (3,) is returned. A turn must be by less than half a turn.
+    By quaternions (w, x, y, z). A rotation has two vectors, of an angle v and, about the same axis,
+    of v - 2 pi. The one nearer to `near` (3,) is returned. A turn must be by less than half a turn.
     """
     w = (1 + turn.diagonal(dim1=-2, dim2=-1).sum(-1)).sqrt() / 2  # (n,)
     skew = turn - turn.mT
@@ -776,7 +780,7 @@ class WindowSampler:
         for label, recorded, expected in (
             ("numbers a state", demonstrations.state.shape[1], config.state_dim),
             ("numbers an action", demonstrations.action.shape[1], config.action_dim),
-            ("numbers a point", point_dim, getattr(config, "point_dim", 3)),
+            ("numbers a point", point_dim, config.point_dim),
         ):
             if recorded != expected:
                 raise RecordingError(
@@ -865,8 +869,8 @@ class WindowSampler:
     def batch(self, n: int, generator: torch.Generator, support: int = 0) -> dict[str, Tensor]:
         """Draws a reference demonstration, and n windows of other episodes where there are any.
 
-        The first `support` windows are of other episodes than the rest, where there are enough: the
-        loss after an inner step on them does not fall because they were seen in it.
+        The first `support` windows are of other episodes than the rest, where there are enough.
+        Otherwise the loss of the rest could fall in an inner step because it has seen them.
         """
         reference = self.sample_episode(generator)
         demo = self.demonstration(reference)

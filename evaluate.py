@@ -111,7 +111,7 @@ def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: dict[str, Tens
     return functional_call(policy, params, (), batch)
 
 
-def inner_rate(
+def rate_of_checkpoint(
     info: dict[str, Any], device: str | torch.device, override: float | None = None
 ) -> maml.InnerRate:
     """The learning rate of an inner step: `override`, or that of the checkpoint's training.
@@ -339,14 +339,14 @@ def checkpoints_of(path: str | Path) -> list[Path]:
     return found
 
 
-def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
+def default_checkpoint(suite: str) -> Path:
     """The last checkpoint of the newest finished run on `suite`; without any, one that ships.
 
     Runs of `tiny` do not count: they show that everything works, and succeed nearly nowhere.
     Raises UserError where there is neither.
     """
     finished, tiny = [], []
-    for config in Path(runs).glob("*/config.json"):
+    for config in Path("runs").glob("*/config.json"):
         with suppress(OSError, ValueError, KeyError, TypeError):  # of a damaged file
             arguments = json.loads(config.read_text())["arguments"]
             last = config.parent / f"ema-{arguments['steps']:05d}.pt"
@@ -363,9 +363,9 @@ def default_checkpoint(suite: str, runs: str | Path = "runs") -> Path:
                 f"{run} is a run of `tiny`, which only shows that everything works, and is never "
                 f"taken unasked: train with --preset small, or add --checkpoint {run}"
             )
-        raise UserError(f"no finished run on {suite} in {runs}/: train one, or name a --checkpoint")
+        raise UserError(f"no finished run on {suite} in runs/: train one, or name a --checkpoint")
     print(
-        f"no finished run on {suite} in {runs}/: using the policy that comes with the code",
+        f"no finished run on {suite} in runs/: using the policy that comes with the code",
         flush=True,
     )
     return shipped
@@ -419,41 +419,48 @@ def keep_policy(
     return load_trained(checkpoint, device, **dict(config_overrides))
 
 
-@lru_cache(maxsize=1)
-def keep_policy_of_task(
-    checkpoint: str | Path,
-    device: str,
-    config_overrides: tuple[tuple[str, Any], ...],
-    recording: Path,
-    n_demonstrations: int | None,
-    text: bytes,
-    inner_steps: int,
-    inner_lr: float | None,
-    support: int | None,
-) -> tuple[DAMIPolicy, WindowSampler, Tensor]:
-    """A policy for a task, kept until this process works on another task, or in another way.
+@dataclass(frozen=True)
+class PolicyOfTask:
+    """Which policy is rolled out on a task, and how it is adapted to it before that.
 
-    The arguments are those of `rollout_job`, all of them hashable.
+    It is hashable: a worker process keeps what it loaded, as long as it is asked for the same.
+    """
+
+    checkpoint: str | Path
+    device: str
+    config_overrides: tuple[tuple[str, Any], ...]  # names and values, see `inference_overrides`
+    recording: Path  # of the task's demonstrations
+    n_demonstrations: int | None  # the first so many of them; None: all
+    text: bytes  # the float32 numbers of the instruction feature
+    inner_steps: int  # these three are explained at `evaluate_checkpoint`
+    inner_lr: float | None
+    support: int | None
+
+
+@lru_cache(maxsize=1)
+def keep_policy_of_task(wanted: PolicyOfTask) -> tuple[DAMIPolicy, WindowSampler, Tensor]:
+    """A policy for a task, kept until this process works on another task, or in another way.
 
     Returns:
         The policy, adapted to the task where there are inner steps; the windows of the task's
         demonstrations; and the instruction feature, (text_dim,).
     """
-    policy, info = keep_policy(checkpoint, device, config_overrides)
-    demonstrations = load_demonstrations(recording).take(n_demonstrations)
-    sampler = WindowSampler(demonstrations, policy.config, device=device)
-    feature = torch.from_numpy(np.frombuffer(text, np.float32).copy()).to(device)
-    if inner_steps > 0:
+    policy, info = keep_policy(wanted.checkpoint, wanted.device, wanted.config_overrides)
+    demonstrations = load_demonstrations(wanted.recording).take(wanted.n_demonstrations)
+    sampler = WindowSampler(demonstrations, policy.config, device=wanted.device)
+    text = torch.from_numpy(np.frombuffer(wanted.text, np.float32).copy()).to(wanted.device)
+    if wanted.inner_steps > 0:
         of_each_step = take_inner_steps(
             policy,
             sampler,
-            feature,
-            steps=inner_steps,
-            batch=support or info["arguments"]["support"],
-            lr=inner_rate(info, device, inner_lr),
+            text,
+            steps=wanted.inner_steps,
+            batch=wanted.support or info["arguments"]["support"],
+            lr=rate_of_checkpoint(info, wanted.device, wanted.inner_lr),
         )
-        _, _, policy = list(of_each_step)[-1]
-    return policy, sampler, feature
+        for _, _, adapted in of_each_step:
+            policy = adapted
+    return policy, sampler, text
 
 
 def evaluate_checkpoint(
@@ -518,22 +525,25 @@ def evaluate_checkpoint(
             seeds = demonstrated[:n_demonstrations][:episodes]
         else:
             seeds = [evaluation_seed(seed, episode) for episode in range(episodes)]
+        wanted = PolicyOfTask(
+            checkpoint=checkpoint,
+            device=str(device),
+            config_overrides=tuple((config_overrides or {}).items()),
+            recording=recording,
+            n_demonstrations=n_demonstrations,
+            text=text[task].cpu().float().numpy().tobytes(),
+            inner_steps=inner_steps,
+            inner_lr=inner_lr,
+            support=support,
+        )
         for start in range(0, len(seeds), episodes_a_job):
             jobs.append(
                 {
-                    "checkpoint": checkpoint,
-                    "device": str(device),
-                    "config_overrides": tuple((config_overrides or {}).items()),  # hashable
+                    "wanted": wanted,
                     "simulator": simulator,
                     "task": task,
-                    "recording": recording,
-                    "n_demonstrations": n_demonstrations,
-                    "text": text[task].cpu().float().numpy().tobytes(),  # hashable
                     "seeds": seeds[start : start + episodes_a_job],
                     "demonstration_control": demonstration_control,
-                    "inner_steps": inner_steps,
-                    "inner_lr": inner_lr,
-                    "support": support,
                     "stop_at_success": stop_at_success,
                     "reference_seed": reference_seed,
                 }
@@ -564,42 +574,22 @@ def evaluate_checkpoint(
 
 
 def rollout_job(
-    checkpoint: str | Path,
-    device: str,
-    config_overrides: tuple[tuple[str, Any], ...],
+    wanted: PolicyOfTask,
     simulator: Simulator,
     task: str,
-    recording: Path,
-    n_demonstrations: int | None,
-    text: bytes,
     seeds: list[int],
     demonstration_control: str | None,
-    inner_steps: int,
-    inner_lr: float | None,
-    support: int | None,
     stop_at_success: bool,
-    reference_seed: int | None = None,
+    reference_seed: int | None,
 ) -> tuple[list[list[bool]], list[list[bool]]]:
     """`rollout` of the episodes of these seeds, of one task, in a worker process.
 
-    The arguments are those of `evaluate_checkpoint`, but for the overrides, which are pairs of name
-    and value, and the instruction feature, whose float32 numbers are the bytes of `text`.
     With a `reference_seed` the demonstration that it draws is held by all rollouts of the task.
 
     Returns for each episode whether each step was a success, and the same of the pair's other task
     where tasks are pairs, see unnamed_tasks.py; elsewhere no episode.
     """
-    policy, sampler, feature = keep_policy_of_task(
-        checkpoint,
-        device,
-        config_overrides,
-        recording,
-        n_demonstrations,
-        text,
-        inner_steps,
-        inner_lr,
-        support,
-    )
+    policy, sampler, text = keep_policy_of_task(wanted)
     environments = environments_of(simulator, task, len(seeds), policy.config.num_points)
     reference = None
     if reference_seed is not None:
@@ -609,7 +599,7 @@ def rollout_job(
         environments=environments,
         seeds=seeds,
         sampler=sampler,
-        text=feature,
+        text=text,
         generator=torch.Generator().manual_seed(seeds[0]),
         demonstration_control=demonstration_control,
         reference=reference,
@@ -617,7 +607,7 @@ def rollout_job(
         on_steps=partial(report_progress, task),
     )
     skipped = len(seeds) * simulator.episode_steps - sum(map(len, successes))
-    report_progress(task, skipped)  # the steps after a success that ended an episode
+    report_progress(task, skipped)  # the steps of episodes that ended early
     others = [env.other_successes for env in environments if hasattr(env, "other_successes")]
     return successes, others
 
@@ -642,7 +632,6 @@ def action_error(
     *,
     demonstrations: WindowSampler | None = None,
     demonstration_control: str | None = None,
-    seed: int = 0,
 ) -> ActionError:
     """How far drawn actions are from an expert's on held-out episodes.
 
@@ -658,10 +647,9 @@ def action_error(
         demonstrations: one of its episodes is the reference demonstration; None: `train_sampler`.
         demonstration_control: what the policy reads in place of its demonstration, a key of
             DEMONSTRATION_CONTROLS; None: the demonstration.
-        seed: of reference demonstrations and noise.
     """
     demonstrations = demonstrations or train_sampler
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)  # of reference demonstrations and noise
     device = text.device
     To, Ta = policy.config.n_obs_steps, policy.config.n_action_steps
     mean_action = train_sampler.action.mean(dim=0)  # (A,)
@@ -1020,6 +1008,8 @@ def check_flags(args: argparse.Namespace) -> None:
             "--inner-steps": args.inner_steps,
             "--swap": args.swap,
             "--controls": args.controls,
+            "--top": args.top,
+            "--stop-at-success": args.stop_at_success,
             "--without demonstration": "demonstration" in args.without,
         }
         for flag, given in not_shown.items():
@@ -1030,6 +1020,8 @@ def check_flags(args: argparse.Namespace) -> None:
     for name in args.swap:
         if name in args.without:
             raise UserError(f"--swap {name} and --without {name}: leave out one of the two")
+    if args.controls and "demonstration" in args.without:
+        raise UserError("--controls change the demonstration: leave out --without demonstration")
     if args.swap and args.top:
         raise UserError("--swap measures the last checkpoint alone: leave out --top")
     if args.swap and args.known_goals:
@@ -1075,10 +1067,11 @@ def choose_tasks(
     args: argparse.Namespace, simulator: Simulator, suite: str, adapted_to: str | None
 ) -> list[str]:
     """The tasks to measure: --task, the one a policy was adapted to, or those of the split."""
-    if args.task and adapted_to and args.task != [adapted_to]:
-        raise UserError(f"this policy was adapted to {adapted_to}, not to {' '.join(args.task)}")
-    if args.task or adapted_to:
-        tasks = args.task or [adapted_to]
+    named = list(dict.fromkeys(args.task or []))  # each once
+    if named and adapted_to and named != [adapted_to]:
+        raise UserError(f"this policy was adapted to {adapted_to}, not to {' '.join(named)}")
+    if named or adapted_to:
+        tasks = named or [adapted_to]
         for task in tasks:
             check_task(simulator, task)
         return tasks
@@ -1253,7 +1246,7 @@ def measure(
     """Rolls out the checkpoints of all runs, and writes and prints the report."""
     out = Path(args.out)
     info = runs[0][-1].info
-    if (out / "adapted.pt").exists():
+    if (out / "adapted.pt").exists() or any(out.glob("adapted-[0-9]*.pt")):
         raise UserError(f"{out} holds an adapted policy: choose another --out")
     old_results = claim_results(out, args.overwrite)
     recordings, text, identity = load_inputs(args, simulator, tasks, info, device)
@@ -1332,7 +1325,10 @@ def main(argv: list[str] | None = None) -> None:
     tasks = choose_tasks(args, simulator, suite, info.get("adapted_to"))
     check_together(list(chain(*runs)), tasks)
     if args.swap and len(tasks) < 2:
-        raise UserError("--swap takes from another task of a split: leave out --task")
+        raise UserError(
+            "--swap takes from another of the tasks that are measured, and this is one alone: name "
+            "two --task, or measure a split"
+        )
 
     if args.gif:
         if len(tasks) > MAX_FILMS:

@@ -77,7 +77,7 @@ class Settings:
         None, "in place of AdamW: steps of meta-training's inner loop, on one batch", least=1
     )
     inner_lr: float | None = setting(
-        None, "learning rate of these steps (default: that of the training, or those)", least=0
+        None, "learning rate of the inner steps (default: training's, learned or fixed)", least=0
     )
     instruction: bool = setting(True, "--no-instruction: adapt and roll out without it")
     normalizer: str = setting(
@@ -87,7 +87,7 @@ class Settings:
         None, "how many (default: 10 or 5, as the suite says; of a file all)", least=1
     )
     held_out: int = setting(
-        0, "of them, the last so many are only for measuring (default: 0)", least=0
+        0, "how many of them, the last ones, are kept for measuring alone (default: 0)", least=0
     )
     episodes: int = setting(20, "rollouts before and after (default: 20)", least=0)
     seed: int = setting(0, "of batches, noise and goals (default: 0)", least=0, most=999)
@@ -128,7 +128,6 @@ def adapt_policy(
     """
     adapted = copy.deepcopy(policy).train()  # line 2
     average = ema_model(adapted)
-    average.module.eval()
     optimizer = torch.optim.AdamW(
         [
             {"params": parameters, "lr": learning_rates[part]}
@@ -226,7 +225,7 @@ def log_heldout_error(
 
 
 def checkpoint_after(folder: Path, step: int) -> Path:
-    """The file of the policy as it is after this step, which is not the last one."""
+    """The checkpoint of an intermediate step."""
     return folder / f"adapted-{step:05d}.pt"
 
 
@@ -237,8 +236,8 @@ def adapt_checkpoint(
     folder: Path,
     settings: Settings,
     *,
-    curve: Sequence[int] = (),
-    config_overrides: dict[str, Any] | None = None,
+    curve: Sequence[int],
+    config_overrides: dict[str, Any],
 ) -> float:
     """Adapts the policy of a checkpoint to the task of a recording, on the device of `text`.
 
@@ -261,8 +260,7 @@ def adapt_checkpoint(
         RecordingError, CheckpointError: one of the two files is damaged, or they do not fit.
         UserError: the loss is not finite.
     """
-    policy, info = evaluate.load_trained(checkpoint, text.device, **(config_overrides or {}))
-    settings = resolve(settings, info)
+    policy, info = evaluate.load_trained(checkpoint, text.device, **config_overrides)
     demonstrations = load_demonstrations(recording).take(settings.demonstrations)
     kept, heldout = hold_out(demonstrations, settings.held_out)
     sampler = WindowSampler(
@@ -302,7 +300,7 @@ def adapt_checkpoint(
             text,
             steps=settings.inner_steps,
             batch=settings.batch,
-            lr=evaluate.inner_rate(info, text.device, settings.inner_lr),
+            lr=evaluate.rate_of_checkpoint(info, text.device, settings.inner_lr),
             seed=settings.seed,
         )
     seconds = 0.0
@@ -345,14 +343,14 @@ def describe_adaptation(
     settings: Settings,
     *,
     curve: Sequence[int],
-    config_overrides: dict[str, Any] | None,
+    config_overrides: dict[str, Any],
 ) -> dict[str, Any]:
     """What config.json says of an adaptation, beside its seconds: all that decides its results."""
     return {
         "checkpoint": str(checkpoint),
         "data": str(recording),
         "curve": list(curve),
-        "config_overrides": config_overrides or {},
+        "config_overrides": config_overrides,
         **asdict(settings),
     }
 
@@ -446,6 +444,9 @@ def check_recording(
     if names is not None and list(names) != [recording.task]:
         raise UserError(f"{file} is a recording of {recording.task}, not of {' '.join(names)}")
     if simulator is not None:
+        made_in = recording.meta["simulator"]
+        if made_in != simulator.name:
+            raise UserError(f"{file} was made in {made_in}: name the --suite of its task")
         check_recipe(recording, file, simulator.recipe)
         check_task(simulator, recording.task)
 
@@ -490,7 +491,7 @@ def read_measured(
         if changed:
             raise UserError(
                 f"{folder} was made with another {', '.join(changed)}: give the same as then, or "
-                "--overwrite it"
+                "--overwrite it without --resume"
             )
         measured[task] = (report.read_outcomes(folder), seconds)
     return measured
@@ -527,7 +528,7 @@ def adapt_tasks(
         Column ("before", "50 steps" ..., "after") -> how the episodes went, no columns without
         rollouts; and the seconds that adapting took, for all tasks together.
     """
-    results: dict[str, Outcomes] = {}
+    results: dict[str, Outcomes] = {}  # column -> those of all tasks
     total_seconds = 0.0
     with WorkerPool(workers) as pool:
         for task, folder in folders.items():
@@ -563,9 +564,8 @@ def adapt_tasks(
                     report.write_report(folder, of_task, {**provenance, "title": task})
             total_seconds += seconds
             for column, outcomes in of_task.items():
-                of_column = results.setdefault(column, Outcomes({}, {}))
-                of_column.any_step.update(outcomes.any_step)
-                of_column.at_end.update(outcomes.at_end)
+                earlier = results.get(column, Outcomes({}, {}))
+                results[column] = earlier.joined(outcomes)
     return results, total_seconds
 
 

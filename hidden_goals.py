@@ -39,7 +39,7 @@ GOALS = {"goal": 320, "validation": 10, "novel": 20}
 
 # Where goals lie: in this box, and so far from the middle of where objects begin, horizontally.
 GOAL_LOW, GOAL_HIGH = (-0.30, 0.50, 0.05), (0.30, 0.90, 0.30)
-GOAL_DISTANCE = (0.21, 0.32)
+GOAL_DISTANCE = (0.21, 0.32)  # less OBJECT_SPREAD more than 0.15, or a start may be rejected
 ON_TABLE = 0.02  # the height of the goals of push
 
 # Where the object begins, at most so far from a middle, and the box in which the hand begins.
@@ -111,6 +111,8 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
     """
 
     rest_after = None
+    camera_pixels = CAMERA_PIXELS
+    hidden_sites = ("goal",)
 
     def __init__(self, task: str, num_points: int = NUM_POINTS, *, episode_steps: int):
         skill, _, _ = split_name(task)
@@ -123,8 +125,6 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         # ours. The space of observations, which follows from it, is not made yet.
         low, high = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 1.5, 1.0])
         self.sawyer_env.goal_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
-
-        self.camera = self.make_camera(CAMERA_PIXELS, hidden_sites=("goal",))
 
     def change_task(self, task: str) -> bool:
         """Changes to another goal of the same skill, which is quicker than a new environment.
@@ -202,7 +202,8 @@ class HiddenGoals:
         """
         name = suite.removeprefix("goals-")
         skill = name.removesuffix("-validation")
-        return names_of(skill, "goal"), names_of(skill, "novel" if name == skill else "validation")
+        others = "novel" if name == skill else "validation"
+        return names_of(skill, "goal"), names_of(skill, others)
 
     def make(self, task: str, num_points: int) -> HiddenGoalEnv:
         """Makes an environment of a task whose clouds have `num_points` points."""

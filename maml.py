@@ -46,7 +46,12 @@ LossFn = Callable[[Params, Any], Tensor]
 
 
 def adapt(
-    loss_fn: LossFn, params: Params, batch: Any, lr: InnerRate, steps: int = 1, first_order=False
+    loss_fn: LossFn,
+    params: Params,
+    batch: Any,
+    lr: InnerRate,
+    steps: int = 1,
+    first_order: bool = False,
 ) -> Params:
     """Returns the parameters after `steps` steps of gradient descent on one batch (Eq. 2).
 
@@ -143,10 +148,13 @@ def chunk_gradient(
     steps: int,
     first_order: bool,
 ) -> tuple[Params, Params, Tensor]:
-    """The sum over some tasks of their meta-gradients, and their query losses (tasks,).
+    """The meta-gradient of some tasks, which run at once, each with adapted parameters of its own.
 
-    In between stand the gradients for `lr`, none where it is a number. `params` require grad, and
-    so does `lr` where it is tensors. Several tasks run at once, and have adapted parameters each.
+    `params` require grad, and so does `lr` where it is tensors.
+
+    Returns:
+        The gradients for `params`, a sum over the tasks; those for `lr`, {} where it is a number;
+        and the query losses (tasks,).
     """
     rates = lr if isinstance(lr, dict) else {}
 

@@ -141,6 +141,8 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
     metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 80}
     rest_after: ClassVar[int | None] = REST_AFTER  # None: the expert never rests
+    camera_pixels: ClassVar[int] = CAMERA_PIXELS
+    hidden_sites: ClassVar[Collection[str]] = ()  # what clouds and pictures do not show
 
     def __init__(
         self,
@@ -166,6 +168,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         sawyer_env._freeze_rand_vec = False  # draw objects and goals at each reset ...
         sawyer_env.seeded_rand_vec = True  # ... from a generator of its own, not NumPy's global
         sawyer_env._partially_observable = False  # the expert needs the goal
+        sawyer_env.max_path_length = episode_steps  # Meta-World's own is 500
         del sawyer_env.sawyer_observation_space  # cached with the goal hidden: clips it to zero
         sawyer_env.touching_object = partial(touching_object, sawyer_env)
         self.sawyer_env = sawyer_env
@@ -176,7 +179,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         model.camera(CAMERA).pos[:] = CAMERA_POSITION
         links = [model.body(name).id for name in ARM_LINKS]
         self.arm_geoms = np.flatnonzero(np.isin(model.geom_bodyid, links))
-        self.camera = self.make_camera(CAMERA_PIXELS)
+        self.camera = self.make_camera(self.camera_pixels, self.hidden_sites)
         self.observation_space = gymnasium.spaces.Dict(
             {
                 "point_cloud": gymnasium.spaces.Box(-np.inf, np.inf, (num_points, 3), np.float32),
@@ -221,13 +224,18 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
     def begin(self, seed: int) -> None:
         """Begins the episode of this seed without casting rays."""
-        self.sawyer_env.seed(seed)
-        self.expert_observation, _ = self.sawyer_env.reset()
-        # Moves the goal markers to this episode's goal: they are still where the last one had them.
-        mujoco.mj_forward(self.sawyer_env.model, self.sawyer_env.data)
+        self.expert_observation = self.reset_simulation(seed)
         self.steps = 0
         self.successes_in_a_row = 0
         self.resting_place = None
+
+    def reset_simulation(self, seed: int) -> np.ndarray:
+        """Puts everything where the episode of this seed begins; returns what the expert reads."""
+        self.sawyer_env.seed(seed)
+        expert_observation, _ = self.sawyer_env.reset()
+        # Moves the goal markers to this episode's goal: they are still where the last one had them.
+        mujoco.mj_forward(self.sawyer_env.model, self.sawyer_env.data)
+        return expert_observation
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
         """Takes one step: `advance`, then `observe`."""

@@ -76,7 +76,6 @@ class PolicyConfig:
     diffusion_steps: int = 100  # K
     inference_steps: int = 10
     sampler: str = "dp3"  # ddim | dp3, see DiffusionSchedule.step
-    action_error: str = "squared"  # squared | huber, see `DAMIPolicy.error`
 
     def __post_init__(self):
         # JSON brings lists back where tuples went in.
@@ -285,8 +284,8 @@ class VisualMotorTrajectory(nn.Module):
         return x
 
 
-# What makes the tokens of a demonstration, by `PolicyConfig.demo_encoder`: built of a
-# configuration, and called as VisualMotorTrajectory is, with any number of tokens instead of T.
+# The encoders of demonstrations by `PolicyConfig.demo_encoder`. Each is built from a PolicyConfig
+# and called as VisualMotorTrajectory is, and may return any number of tokens instead of T.
 demo_encoders: dict[str, type[nn.Module]] = {"vmt": VisualMotorTrajectory}
 
 
@@ -490,8 +489,9 @@ class ConditionalUNet1d(nn.Module):
         return self.head(x).transpose(1, 2)  # (B, H, A)
 
 
-# The networks by `PolicyConfig.denoiser`: built of a configuration, and called as ConditionalUNet1d
-# is, with `fused` only where the configuration reads a task. Another network is a class and a line.
+# The networks by `PolicyConfig.denoiser`. Each is built from a PolicyConfig and called as
+# ConditionalUNet1d is, with `fused` only where the configuration reads a task. Another network is a
+# class and a line here.
 denoisers: dict[str, type[nn.Module]] = {"unet": ConditionalUNet1d}
 
 
@@ -504,7 +504,9 @@ class DiffusionSchedule(nn.Module):
     Betas follow the squared-cosine schedule of improved DDPM, capped at 0.999.
     """
 
-    def __init__(self, diffusion_steps: int = 100, inference_steps: int = 10, sampler="ddim"):
+    def __init__(
+        self, diffusion_steps: int = 100, inference_steps: int = 10, sampler: str = "ddim"
+    ):
         super().__init__()
         self.sampler = sampler
         self.diffusion_steps, self.inference_steps = diffusion_steps, inference_steps
@@ -620,8 +622,7 @@ class DAMIPolicy(nn.Module):
     """
 
     # What a subclass may override:
-    requires: ClassVar[dict[str, str]] = {}  # the fields of its configuration with only one value
-    HUBER_DELTA: ClassVar[float] = 0.05  # normalized actions lie in [-1, 1]
+    requires: ClassVar[dict[str, str]] = {}  # fields of its configuration that it fixes
     conditioned_by_h: ClassVar[bool] = True  # whether its denoiser is modulated by h_k
 
     def __init__(self, config: PolicyConfig):
@@ -766,21 +767,11 @@ class DAMIPolicy(nn.Module):
         clean = self.normalizer.normalize("action", action)  # A_0, (B, H, A)
         noisy = self.schedule.add_noise(clean, noise, timesteps)  # A_k, (B, H, A)
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
-        return self.error(self.denoise(noisy, timesteps, observation, context), clean)
+        return F.mse_loss(self.denoise(noisy, timesteps, observation, context), clean)
 
-    def error(self, prediction: Tensor, clean: Tensor) -> Tensor:
-        """How far predicted actions are from clean ones, () float; both (B, H, A), normalized.
-
-        "squared" is the mean square. It is smallest at the mean of the actions that an observation
-        leaves possible. Where nearly all of these rest and a few still move on, the mean moves a
-        little, at every step, and carries the hand away. "huber" counts linearly what exceeds
-        `HUBER_DELTA`. It is smallest near the median, which rests.
-        """
-        if self.config.action_error == "squared":
-            return F.mse_loss(prediction, clean)
-        return 2 * F.huber_loss(prediction, clean, delta=self.HUBER_DELTA)
-
-    forward = loss  # so that torch.func.functional_call(policy, params, (), batch) is the loss
+    def forward(self, **batch: Tensor) -> Tensor:
+        """`loss`, so that torch.func.functional_call(policy, params, (), batch) is the loss."""
+        return self.loss(**batch)
 
     @torch.no_grad()
     def sample_actions(
@@ -871,11 +862,12 @@ class DAMIPolicy(nn.Module):
 class DP3Policy(DAMIPolicy):
     """DP3: the policy without demonstration and instruction."""
 
-    requires: ClassVar = {"demo_encoder": "none", "tcfm": "none", "action_error": "squared"}
+    requires: ClassVar = {"demo_encoder": "none", "tcfm": "none"}
 
 
 def ema_model(policy: DAMIPolicy) -> AveragedModel:
-    """The exponential moving average of a policy in training; the averaged policy is its `.module`.
+    """The exponential moving average of a policy in training; the averaged policy is its `.module`,
+    in evaluation mode.
 
     `.update_parameters(policy)` must be called after each step. The decay grows as in the paper.
     """
@@ -885,7 +877,9 @@ def ema_model(policy: DAMIPolicy) -> AveragedModel:
         decay = min(0.9999, 1 - (1 + int(step)) ** -0.75)
         torch._foreach_lerp_(averaged, current, 1 - decay)
 
-    return AveragedModel(policy, multi_avg_fn=update)
+    average = AveragedModel(policy, multi_avg_fn=update)
+    average.module.eval()
+    return average
 
 
 # ---- What a configuration names, and presets -----------------------------------------------------
@@ -903,7 +897,6 @@ def choices() -> dict[str, tuple[str, ...]]:
         "demo_encoder": (*demo_encoders, "none"),
         "tcfm": ("down", "mid", "up", "none"),
         "sampler": ("ddim", "dp3"),
-        "action_error": ("squared", "huber"),
     }
 
 
@@ -1001,10 +994,15 @@ def load(
     del content["format"]
     config, weights = content.pop("config"), content.pop("model")
 
+    if unknown := sorted(set(config) - {field.name for field in fields(PolicyConfig)}):
+        raise CheckpointError(
+            f"{path} is of another version of the code, with settings that are unknown here: "
+            f"{', '.join(unknown)}"
+        )
     try:
         config = PolicyConfig(**config)
         POLICIES[config.policy].check_config(config)
-    except (TypeError, ValueError) as error:  # TypeError: a field of another version
+    except (TypeError, ValueError) as error:
         raise CheckpointError(
             f"{path}: weights and configuration do not fit: {one_line(error)}"
         ) from error
@@ -1135,10 +1133,10 @@ class CriticalPoints(torch.autograd.Function):
         Returns the critical points of all clouds, (R,) int64 in [0, clouds * N), each once; and for
         each cloud and channel the place of its maximum among them, (clouds, channels) int64.
         """
-        largest = CriticalPoints.largest(points, layers)  # (clouds, channels)
+        argmax = CriticalPoints.argmax(points, layers)  # (clouds, channels)
         clouds, N = points.shape[:-2].numel(), points.shape[-2]
-        marked, place = CriticalPoints.mark(largest, clouds * N)
-        return CriticalPoints.rows(marked, min(clouds * N, largest.numel())), place
+        marked, place = CriticalPoints.mark(argmax, clouds * N)
+        return CriticalPoints.rows(marked, min(clouds * N, argmax.numel())), place
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
@@ -1154,43 +1152,45 @@ class CriticalPoints(torch.autograd.Function):
             points, *layers = (
                 x if dim is None else x.select(dim, task) for x, dim in zip(inputs, in_dims)
             )
-            largest = CriticalPoints.largest(points, layers)
-            in_task, place = CriticalPoints.mark(largest, points.shape[:-1].numel())
+            argmax = CriticalPoints.argmax(points, layers)
+            in_task, place = CriticalPoints.mark(argmax, points.shape[:-1].numel())
             marked.append(in_task)
             places.append(place)
-        rows = CriticalPoints.rows(torch.stack(marked), min(len(in_task), largest.numel()))
+        rows = CriticalPoints.rows(torch.stack(marked), min(len(in_task), argmax.numel()))
         return (rows, torch.stack(places)), (0, 0)
 
     @staticmethod
-    def largest(points: Tensor, layers: Sequence[Tensor]) -> Tensor:
+    def argmax(points: Tensor, layers: Sequence[Tensor]) -> Tensor:
         """points (..., N, P) -> of each cloud and channel the point in [0, clouds * N)."""
         clouds = points.reshape(-1, *points.shape[-2:])  # (clouds, N, P)
         N = clouds.shape[-2]
         at_once = len(clouds) if points.is_cuda else max(1, 4096 // N)
-        largest = []
+        places = []
         for x in clouds.split(at_once):
-            for weight, bias, norm_weight, norm_bias in zip(*(layers[i::4] for i in range(4))):
+            for layer in range(0, len(layers), 4):
+                weight, bias, norm_weight, norm_bias = layers[layer : layer + 4]
                 x = F.linear(x, weight, bias)  # (at_once, N, width)
                 x = F.layer_norm(x, bias.shape, norm_weight, norm_bias).relu_()
-            largest.append(x.max(dim=-2).indices)  # (at_once, channels); faster than argmax
+            places.append(x.max(dim=-2).indices)  # (at_once, channels); faster than x.argmax
         first_points = N * torch.arange(len(clouds), device=points.device)  # of each cloud
-        return torch.cat(largest) + first_points[:, None]  # (clouds, channels)
+        return torch.cat(places) + first_points[:, None]  # (clouds, channels)
 
     @staticmethod
-    def mark(largest: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    def mark(argmax: Tensor, n: int) -> tuple[Tensor, Tensor]:
         """The n points of all clouds, 1 for critical ones, (n,) int8; and the places, see above."""
-        marked = torch.zeros(n, dtype=torch.int8, device=largest.device)
-        marked.scatter_(0, largest.flatten(), 1)
-        return marked, (marked.cumsum(0) - 1)[largest]
+        marked = torch.zeros(n, dtype=torch.int8, device=argmax.device)
+        marked.scatter_(0, argmax.flatten(), 1)
+        return marked, (marked.cumsum(0) - 1)[argmax]
 
     @staticmethod
     def rows(marked: Tensor, bound: int) -> Tensor:
         """(..., n) int8 -> (..., R) int64: the critical points in their order, then others.
 
-        R is the largest number of critical points (on a GPU a bound of it).
+        R is the largest number of critical points that a row of `marked` has. On a GPU it is
+        `bound`, so that the host need not wait for the count.
         """
         if marked.is_cuda:
-            most = bound  # the host does not wait for the GPU
+            most = bound
         else:
             most = int(marked.sum(dim=-1).max())
         return marked.argsort(dim=-1, descending=True, stable=True)[..., :most]

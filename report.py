@@ -36,6 +36,15 @@ class Outcomes:
     at_end: Successes | None  # whether the last one did; None: not measured
     other_task: Successes | None = None  # whether any step did the other task of a pair
 
+    def joined(self, others: "Outcomes") -> "Outcomes":
+        """These and those of other tasks; both were measured at the end, too."""
+        other_task = {**(self.other_task or {}), **(others.other_task or {})}
+        return Outcomes(
+            any_step=self.any_step | others.any_step,
+            at_end=self.at_end | others.at_end,
+            other_task=other_task or None,
+        )
+
 
 # ---- Numbers -------------------------------------------------------------------------------------
 
@@ -231,13 +240,14 @@ def write_report(
     if checkpoints:
         report["checkpoints"] = {label: outcome.any_step for label, outcome in checkpoints.items()}
     note = ", ".join(f"{name} {value}" for name, value in provenance.items())
+    measured = "at any step, or at the end" if kinds["at the end"] else "at any step"
 
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "success.json", json.dumps(report, indent=1))
     write_text(
         folder / "success.md",
-        f"{table}\n\nPercent of the episodes that were a success at any step, or at the end, with "
-        f"Wilson's 95 % interval. {note}.\n",
+        f"{table}\n\nPercent of the episodes that were a success {measured}, with Wilson's 95 % "
+        f"interval. {note}.\n",
     )
     plot_success(columns, folder / "success.png", provenance.get("title", "Success"), paper)
     return table

@@ -8,14 +8,14 @@ al. 2019); the paper does not say. No demonstration, no cloud, no instruction: a
 a state to a Gaussian of actions, and learns from rewards. The state lacks the goal's coordinates.
 In a task such as reach nothing else in it depends on the goal, so that only rewards tell the goal.
 
-In each iteration, for each of some goals (`goal_job`), with L as in `GaussianPolicy.loss`
+An iteration does this for each of some goals (`goal_job`), with L as in `GaussianPolicy.loss`:
 
     1. rollouts with theta: the support set
     2. theta' = theta - alpha * grad L(theta, support)
     3. rollouts with theta': the query set
 
-and then one step of TRPO (Schulman et al. 2015) on theta, through the inner step (`trpo_step`).
-Both gradients are maml.py's, which works for any loss.
+It ends with one step of TRPO (Schulman et al. 2015) on theta, through the inner step
+(`trpo_step`). Both gradients are maml.py's, which works for any loss.
 
 Letters: R rollouts to a goal, T steps of a rollout, S state dim, A action dim, F features of the
 baseline, B = R * T.
@@ -77,7 +77,7 @@ class Settings:
     seed: int = setting(0, "of weights, goals and actions", least=0, most=999)
     steps: int = setting(20_000_000, "of the simulator, in all rollouts", least=1)
     goals: int = setting(20, "goals of an iteration", least=1)
-    rollouts: int = setting(10, "rollouts to a goal, before and after the inner step", least=1)
+    rollouts: int = setting(10, "rollouts to a goal, before the inner step and after it", least=1)
     hidden: int = setting(128, "width of the two hidden layers", least=1)
     inner_lr: float = setting(0.1, "learning rate of the inner step", least=0)
     discount: float = setting(0.99, "of rewards, for each step", least=0, most=1)
@@ -87,7 +87,7 @@ class Settings:
     damping: float = setting(1e-5, "added to the Fisher matrix's diagonal", least=0)
     backtracks: int = setting(15, "steps that the line search tries", least=1)
     backtrack_ratio: float = setting(
-        0.8, "factor of each step that it tries to the one before", least=0, most=1
+        0.8, "length of each step that it tries, relative to the one before", least=0, most=1
     )
     episodes: int = setting(20, "goals of each task that are measured", least=1)
 
@@ -515,10 +515,12 @@ def restore(path: Path, settings: Settings, suite: str) -> Run:
         raise UserError(f"there is no run to resume in {path.parent}: look at --out")
     try:
         saved = torch.load(path, weights_only=True)
-        policy = GaussianPolicy(*saved["shape"])
-        policy.load_state_dict(saved["weights"])
     except Exception as error:  # torch.load raises many kinds for a damaged file
-        raise UserError(f"{path} is damaged: remove its folder and train again") from error
+        raise UserError(f"{path} is damaged: train again, with another --out") from error
+    if not isinstance(saved, dict) or "shape" not in saved:
+        raise UserError(f"{path} is of no run of rl.py: look at --out")
+    policy = GaussianPolicy(*saved["shape"])
+    policy.load_state_dict(saved["weights"])
     changed = [
         name
         for name, value in asdict(settings).items()
@@ -669,6 +671,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             run = restore(checkpoint, settings, args.suite)
         elif checkpoint.exists():
             raise UserError(f"{folder} already holds a run: add --resume, or another --out")
+        elif (folder / "success.json").exists():
+            raise UserError(f"{folder} already holds results: choose another --out")
         else:
             run = start(simulator, args.suite, settings)
         print_settings(asdict(settings), asdict(Settings()))

@@ -710,13 +710,18 @@ class Gripper:
 # ---- Camera: depth to points in the robot's base frame -------------------------------------------
 
 
+def has_depth(depth: np.ndarray) -> np.ndarray:
+    """Which pixels of a depth image (H, W) have depth, (H, W) bool."""
+    return np.isfinite(depth) & (depth > 0)
+
+
 def depth_to_points(depth: np.ndarray, intrinsics: Sequence[float]) -> np.ndarray:
     """Depth (H, W), metres -> points (M, 3) float32, camera frame: right, down, forward.
 
     `intrinsics` are those of the depth image, in pixels: two focal lengths, the principal point.
     """
     fx, fy, cx, cy = intrinsics
-    rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
+    rows, columns = np.nonzero(has_depth(depth))
     z = depth[rows, columns]
     return np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=-1).astype(np.float32)
 
@@ -993,13 +998,13 @@ class Servo:
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
         self.broken_off = False  # targets were left out, by `hold`
         self.held_since = time.monotonic()
-        self.missing = self.SLOW  # why the arm holds
+        self.hold_reason = self.SLOW  # why the arm holds
 
         self.lock = threading.Lock()  # of the targets
         self.error: str | None = None  # why the arm was stopped
         self.ended = threading.Event()
         self.counters: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
-        self.delay = math.inf  # of the promptest state; like all delays, plus a constant
+        self.least_delay = math.inf  # of the promptest state; like all delays, plus a constant
         self.last_step = (time.monotonic(), time.process_time())  # of the stream
         self.stall = ""  # why the stream stood still for so long that the watchdog may have struck
         self.stalled_at = -math.inf  # when that was noticed
@@ -1133,7 +1138,7 @@ class Servo:
                 self.targets.pop(0)
             if self.targets:
                 when, target = self.targets[0]
-                share = min(1.0, dt / max(when - now + dt, dt))  # of what is left, in this tick
+                share = dt / (max(when - now, 0.0) + dt)  # of what is left, in this tick
                 before = self.pose
                 goal = compose(before, share * difference(before, target))
                 self.pose = toward(before, goal, self.speed * dt)
@@ -1217,7 +1222,7 @@ class Servo:
                 f"the arm is {metres:.3f} m, {radians:.3f} rad behind: blocked, or slowed down"
             )
         if now - self.held_since > settings.max_hold_s:
-            raise RobotError(f"no new actions for {settings.max_hold_s:g} s: {self.missing}")
+            raise RobotError(f"no new actions for {settings.max_hold_s:g} s: {self.hold_reason}")
 
     def check_progress(self, state: State, now: float) -> None:
         """Raises RobotError if controller or program do not go on, or states come later."""
@@ -1242,11 +1247,11 @@ class Servo:
 
         delay = now - values["timestamp"]  # plus a constant: the clocks began at different times
         drift = 1e-3 / self.settings.servo_hz  # clocks may drift apart by a thousandth
-        self.delay = min(self.delay + drift, delay)
+        self.least_delay = min(self.least_delay + drift, delay)
         _, since = self.counters["the controller's clock"]
-        state_is_new = since == now
-        if state_is_new and delay - self.delay > max_age:
-            raise RobotError(f"states arrive {delay - self.delay:.3f} s later than at first")
+        state_is_new = since == now  # its clock went on just now
+        if state_is_new and delay - self.least_delay > max_age:
+            raise RobotError(f"states arrive {delay - self.least_delay:.3f} s later than at first")
 
     def check(self) -> None:
         """Raises RobotError if the arm was stopped."""
@@ -1331,12 +1336,12 @@ class Cell:
             except CameraError as error:
                 if servo is None:
                     raise
-                servo.missing = str(error)
+                servo.hold_reason = str(error)
                 servo.hold()
                 servo.check()
                 time.sleep(0.02)
         if servo is not None:
-            servo.missing = Servo.SLOW
+            servo.hold_reason = Servo.SLOW
         pose = self.rtde.state(self.settings.max_state_age_s).pose
         pose[3:] = nearer(pose[3:], np.array(self.settings.rotation_near_rad))
         with self.activity.during("reading the gripper"):
@@ -1878,9 +1883,11 @@ def record_camera(args: argparse.Namespace) -> None:
     out = Path(args.out)
     if out.suffix != ".npz" or not out.parent.is_dir():
         raise UserError(f"--out is {out}: name an .npz file in a folder that exists")
+    if args.frames < 1:
+        raise UserError(f"--frames is {args.frames}: use at least 1")
     camera = RecordedCamera(args.camera) if args.camera else RealSense()
     try:
-        depth = np.stack([camera.read() for _ in range(max(1, args.frames))])  # (F, H, W) metres
+        depth = np.stack([camera.read() for _ in range(args.frames)])  # (F, H, W) metres
     finally:
         camera.close()
     millimetres = (1000 * depth).round().clip(0, 65535).astype(np.uint16)

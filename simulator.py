@@ -34,10 +34,10 @@ class OutOfSightError(Exception):
 
 
 class Environment(Protocol):
-    """One task of a simulator. An episode is `begin`, then `observe` and `advance` in turns.
+    """One task of a simulator. An episode is `begin`, then `advance`, again and again.
 
-    `observe` and `render` cost time and change nothing, so they are called only where their result
-    is needed.
+    `observe` and `render` cost time and change nothing. They are called in between, where their
+    result is needed.
     """
 
     def begin(self, seed: int) -> None:
@@ -48,8 +48,8 @@ class Environment(Protocol):
 
         "point_cloud" (N, 3) float32, or (N, point_dim) where points have features such as colours;
         in the order of farthest point sampling, so that its first k points are a good sample, too.
-        "agent_pos" (S,) float32. World frame, metres. Raises OutOfSightError where nothing is seen;
-        a rollout is over then, and its end is no success.
+        "agent_pos" (S,) float32. World frame, metres. Raises OutOfSightError where nothing is seen.
+        A rollout in which this happens after a step is over then, and its end is no success.
         """
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
@@ -308,7 +308,7 @@ def collect(
     paths = {check_task(simulator, task): folder / f"{task}.npz" for task in tasks}
     if not 1 <= episodes <= seeds_of_a_task(simulator):
         bound = "at least 1" if episodes < 1 else f"at most {seeds_of_a_task(simulator)}"
-        raise UserError(f"--episodes is {episodes}: use {bound}")
+        raise UserError(f"{episodes} demonstrations of a task: use {bound}")
     episode_seed(seed, 0)  # refuses a seed out of range
 
     missing = missing_tasks(simulator, paths, episodes, seed)
@@ -385,7 +385,7 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
         if attempts == most_attempts:
             raise UserError(
                 f"{task}: the expert succeeded in {len(recorded)} of {attempts} episodes; "
-                "try another --seed"
+                "`python simulator.py --seed` tries others"
             )
         drawn_seed = demonstration_seed(simulator, task, seed, attempts)
         attempts += 1

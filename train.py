@@ -61,7 +61,7 @@ from data import (
     suspicions,
     write_text,
 )
-from maml import InnerRate, adapt, meta_gradient
+from maml import InnerRate, meta_gradient
 from model import TASK_INPUTS, CheckpointError, DAMIPolicy, PolicyConfig, ema_model, split
 from report import Outcomes
 from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
@@ -196,7 +196,6 @@ PAIRS = {"instruction_dropout": 0.0, "after_success": None, "late_fraction": 0.0
 # What turned actions change. Augmentation also stretches scenes, and so would change the angle.
 CONVENTION = {
     "demonstrations": 8,
-    "tasks_per_step": 16,  # all
     "augment": False,
     "instruction_dropout": 0.0,
     "after_success": None,
@@ -293,7 +292,7 @@ def multi_task_gradient(
     return dict(zip(parameters, gradients)), loss.detach()
 
 
-def inner_rate(log_rates: dict[str, Tensor], settings: Settings) -> InnerRate:
+def rate_in_training(log_rates: dict[str, Tensor], settings: Settings) -> InnerRate:
     """The inner learning rate as maml.py takes it: those that are learned, or the setting."""
     if not log_rates:
         return settings.inner_lr
@@ -313,7 +312,7 @@ def maml_gradient(
     `log_rates` are those of the `TrainingState`. Returns parameter name -> gradient, the same for
     `log_rates`, and the mean query loss after the inner step, ().
     """
-    inner_lr = inner_rate(log_rates, settings)
+    inner_lr = rate_in_training(log_rates, settings)
     gradients, rate_gradients, losses = meta_gradient(
         partial(evaluate.loss_of, policy),
         dict(policy.named_parameters()),
@@ -641,7 +640,7 @@ class Evaluation:
             "device": self.device,
             "n_demonstrations": self.n_demonstrations,
         }
-        return evaluate.evaluate_checkpoint(**{**arguments, **options})
+        return evaluate.evaluate_checkpoint(**(arguments | options))
 
     def run(self, step: int, stop: StopRequest) -> Outcomes | None:
         """Rolls out the checkpoint of a step and logs the outcomes, or reads them from the log.
@@ -654,7 +653,9 @@ class Evaluation:
             return None
         for line in read_json_lines(self.folder / "metrics.jsonl"):
             if line["step"] == step and "successes_at_end" in line:
-                logged = Outcomes(line["successes"], line["successes_at_end"])
+                logged = Outcomes(
+                    line["successes"], line["successes_at_end"], line.get("successes_at_other_task")
+                )
                 if all(len(x) == settings.episodes for x in logged.any_step.values()):
                     return logged  # otherwise --episodes was another then
         try:
@@ -669,17 +670,18 @@ class Evaluation:
             success_at_end=report.mean_success(outcomes.at_end),
             successes=outcomes.any_step,
             successes_at_end=outcomes.at_end,
+            successes_at_other_task=outcomes.other_task,
         )
         return outcomes
 
     def contributions(
         self, own: Outcomes, reads_demonstration: bool, stop: StopRequest
     ) -> dict[str, Outcomes]:
-        """What demonstration and inner step do on tasks that no observation names.
+        """What demonstration and inner step contribute to success on the tasks that are measured.
 
         Title -> outcomes of the last checkpoint: with each task's own demonstration (`own`, which
         is measured already), with that of another task, and without any; then the same after an
-        inner step, if there was any in training. Also animates the first two tasks, from one start.
+        inner step, if there was any in training. Also animates the first two tasks, from one seed.
         """
         settings = self.settings
         checkpoint = self.folder / f"ema-{settings.steps:05d}.pt"
@@ -707,7 +709,7 @@ class Evaluation:
         return columns
 
     def animate(self, checkpoint: Path) -> None:
-        """Writes goals.gif: the first two tasks, from one start."""
+        """Writes goals.gif: the first two tasks, from one seed."""
         policy, _ = evaluate.load_trained(checkpoint, self.device)
         samplers = [
             WindowSampler(
@@ -762,7 +764,7 @@ def log_heldout_errors(
             heldout_samplers,
             text,
             settings,
-            inner_lr=inner_rate(state.log_rates, settings),
+            inner_lr=rate_in_training(state.log_rates, settings),
         )
         rows.update(controls)
     names = next(iter(train_samplers.values())).action_names
@@ -795,29 +797,20 @@ def heldout_controls(
     if settings.pretrain_steps == settings.steps:  # there was no inner step in training
         return rows
 
-    params = {name: p.detach() for name, p in policy.named_parameters()}
-    for steps in (1, 5):
-        measured = {}
-        for i, (task, heldout_sampler) in enumerate(heldout_samplers.items()):
-            sampler = copy.copy(train_samplers[task])
-            sampler.augment = False  # finetune.py --inner-steps, too, leaves scenes as they are
-            support = task_batch(
-                policy,
-                sampler,
-                text[task],
-                n=settings.support,
-                seed=(settings.seed, settings.steps, i),  # a step that no training takes
-                settings=replace(settings, instruction_dropout=0.0, task_dropout=0.0),
-            )
-            adapted = copy.deepcopy(policy)
-            adapted.load_state_dict(
-                adapt(partial(evaluate.loss_of, policy), params, support, inner_lr, steps),
-                strict=False,
-            )
-            measured[task] = evaluate.action_error(
-                adapted, train_samplers[task], heldout_sampler, text[task]
-            )
-        rows[f"after {common.count(steps, 'inner step')}"] = mean_of_tasks(measured)
+    measured = {1: {}, 5: {}}  # inner steps -> task -> its action error
+    for task, heldout_sampler in heldout_samplers.items():
+        sampler = copy.copy(train_samplers[task])
+        sampler.augment = False  # finetune.py --inner-steps, too, leaves scenes as they are
+        of_each_step = evaluate.take_inner_steps(
+            policy, sampler, text[task], steps=5, batch=settings.support, lr=inner_lr
+        )
+        for step, _, adapted in of_each_step:
+            if step in measured:
+                measured[step][task] = evaluate.action_error(
+                    adapted, sampler, heldout_sampler, text[task]
+                )
+    for step, of_tasks in measured.items():
+        rows[f"after {common.count(step, 'inner step')}"] = mean_of_tasks(of_tasks)
     return rows
 
 
@@ -868,15 +861,7 @@ def report_training(
 # the paper's number on a real robot.
 OWN_FRAMES = 500
 # The fields of PolicyConfig that are flags
-ARCHITECTURE = (
-    "policy",
-    "demo_encoder",
-    "denoiser",
-    "tcfm",
-    "sampler",
-    "action_error",
-    "num_points",
-)
+ARCHITECTURE = ("policy", "demo_encoder", "denoiser", "tcfm", "sampler", "num_points")
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -1019,10 +1004,13 @@ def check_folder(folder: Path, resume: bool) -> None:
         raise UserError(f"{folder} already holds a run: add --resume, or another --out")
 
 
-def begin_log(
+def begin_files(
     folder: Path, step: int, settings: Settings, config: PolicyConfig, provenance: dict[str, Any]
 ) -> None:
-    """Writes config.json, drops what was logged later than `step`; prints new runs' settings."""
+    """Writes config.json, and drops what was logged later than `step`.
+
+    It also prints the settings of a new run, or where an old one goes on.
+    """
     if step == 0:
         default = baselines.PRESETS[config.policy][settings.preset]
         common.print_settings(
@@ -1143,7 +1131,7 @@ def run(
         device=device,
     )
     if rank == 0:
-        begin_log(folder, state.step, settings, config, provenance)
+        begin_files(folder, state.step, settings, config, provenance)
 
     bar = common.progress_bar(
         desc="training", unit="step", total=settings.steps, initial=state.step, disable=rank != 0
@@ -1203,18 +1191,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     config = choose_architecture(args, preset)
 
     # Own recordings, or the base tasks of a suite
+    simulator = None if own else simulator_of(suite)
+    settings = choose_settings(args, preset, suite, config)
+    novel_paths = {}  # of tasks that are not trained on, if they are evaluated on
     if own:
-        simulator = None
-        settings = choose_settings(args, preset, suite, config)
         paths = own_recordings(Path(args.data))
-        novel_paths = {}
     else:
-        simulator = simulator_of(suite)
-        settings = choose_settings(args, preset, suite, config)
         base_tasks, novel_tasks = simulator.tasks(suite)
         data = Path(args.data or "data")
         paths = {task: data / f"{task}.npz" for task in draw_base_tasks(base_tasks, settings)}
-        novel_paths = {}  # if they are evaluated on
         if settings.evaluate_on == "novel" and not novel_tasks:
             raise UserError(f"--evaluate-on novel: {suite} has no novel tasks")
         if settings.evaluate_on == "novel" and settings.episodes > 0:

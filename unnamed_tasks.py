@@ -108,6 +108,8 @@ class PairEnv(MetaWorldPointCloudEnv):
     """
 
     rest_after = None
+    camera_pixels = CAMERA_PIXELS
+    hidden_sites = MARKERS
 
     def __init__(self, task: str, num_points: int = NUM_POINTS, *, episode_steps: int):
         super().__init__(task.removesuffix("-hidden"), num_points, episode_steps=episode_steps)
@@ -121,14 +123,18 @@ class PairEnv(MetaWorldPointCloudEnv):
         self.other_env._set_task_called = True
         self.other_env.model = self.sawyer_env.model
         self.other_env.data = self.sawyer_env.data
-        self.camera = self.make_camera(CAMERA_PIXELS, hidden_sites=MARKERS)
 
     def begin(self, seed: int) -> None:
         """Begins the episode of this seed without casting rays."""
-        object_start, hand_start = pair_start(self.scene, seed)
+        super().begin(seed)
+        self.other_successes = []
+
+    def reset_simulation(self, seed: int) -> np.ndarray:
+        """Puts everything where the episode of this seed begins; returns what the expert reads."""
+        object_start, hand = pair_start(self.scene, seed)
         # Both tasks are told where the object begins, since their goals follow from that.
         for env in (self.other_env, self.sawyer_env):
-            env.hand_init_pos = hand_start
+            env.hand_init_pos = hand
             env._freeze_rand_vec = True  # not drawn: the object begins here
             env._last_rand_vec = object_start
             env.reset()
@@ -137,10 +143,7 @@ class PairEnv(MetaWorldPointCloudEnv):
         data.joint(scene.joint).qpos[:] = scene.joint_start
         mujoco.mj_forward(self.sawyer_env.model, data)
         self.sawyer_env._get_obs()  # an observation holds the one before, which is to be of now
-        self.expert_observation = self.sawyer_env._get_obs()
-        self.steps = 0
-        self.successes_in_a_row = 0
-        self.other_successes = []
+        return self.sawyer_env._get_obs()
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
         """Takes one step without casting rays. Returns (reward, truncated, info)."""
@@ -208,13 +211,13 @@ class TurnedActionsEnv(MetaWorldPointCloudEnv):
     """
 
     rest_after = None
+    camera_pixels = CAMERA_PIXELS
 
     def __init__(self, task: str, num_points: int = NUM_POINTS, *, episode_steps: int):
         skill, _, _ = task.split("-")
         super().__init__(skill, num_points, episode_steps=episode_steps)
         self.task = task
         self.angle = angle_of(task)
-        self.camera = self.make_camera(CAMERA_PIXELS)
 
     def begin(self, seed: int) -> None:
         """Begins the episode of this seed without casting rays."""

@@ -515,3 +515,6 @@ def test_only_the_text_weights_of_a_checkpoint_are_accepted(monkeypatch):
     with pytest.raises(clip.TextWeightsError, match=message):
         text_features(["a"], None, "openai-ViT-B-32-40d36571")
     assert asked[1:] == [(None, {})]
+    with pytest.raises(clip.TextWeightsError, match="'state-dict-1234abcd': name their file with"):
+        text_features(["a"], None, "state-dict-1234abcd")
+    assert len(asked) == 2  # nothing is looked for, nor downloaded

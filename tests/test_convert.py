@@ -43,6 +43,8 @@ def test_show_draws_a_picture_of_an_episode_that_there_is(capsys):
     assert "reach.png" in capsys.readouterr().out
     message = fails(convert, ["--show", "reach.npz", "--episode", "2"], capsys)
     assert "reach.npz: holds episodes 0 to 1, not 2" in message
+    message = fails(convert, ["--show", "reach.npz", "--out", "reach.v2"], capsys)
+    assert "--out is reach.v2: name a .png file" in message
 
 
 def test_the_script_itself_ends_in_one_line_where_a_file_is_missing():
@@ -69,12 +71,12 @@ def hand(path, task="reach", **changes):
 def test_checking_a_folder_says_what_looks_wrong_and_in_which_file(capsys, monkeypatch):
     arrays = hand("own/good.npz")
     convert.main(["--check", "own"])
-    assert capsys.readouterr().out == "1 checked, nothing suspicious\n"
+    assert capsys.readouterr().out == "files checked: 1, suspicions: 0\n"
     hand("own/wrong.npz", state=1000 * arrays["state"])
     convert.main(["--check", "own"])
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("own/wrong.npz: position 0 of the state lies far from the points")
-    assert lines[1:] == ["2 checked, 1 suspicious"]
+    assert lines[1:] == ["files checked: 2, suspicions: 1"]
     monkeypatch.setattr(convert, "plot_demonstration", lambda *_: None)
     convert.main(["--show", "own/wrong.npz"])
     assert lines[0].split(" (")[0] in capsys.readouterr().out

@@ -412,6 +412,7 @@ REFUSED = {
     "--data nowhere.npz --checkpoint {run}": "is no name",
     "--data {recorded}/reach.npz --task drawer-close": "is a recording of reach, not of drawer-",
     "--data otherwise.npz": "otherwise.npz was recorded with another camera",
+    "--data elsewhere.npz": "elsewhere.npz was made in meta-world-hidden: name the --suite of its",
     "--data wide.npz --checkpoint {run} --out old --overwrite": "the policy 4: use",
     "--data own.npz --checkpoint {run} --out taken": "taken cannot be written to",
     "--data own.npz --checkpoint {run} --out {run} --overwrite": "holds a training run",
@@ -433,6 +434,8 @@ def files(recorded):
     reach = data.load_demonstrations(recorded / "reach.npz")
     reach.meta["camera"] = "another"
     data.save_demonstrations("otherwise.npz", reach)
+    reach.meta["simulator"] = "meta-world-hidden"
+    data.save_demonstrations("elsewhere.npz", reach)
     Path("taken").write_text("a file")
     Path("old").mkdir()
     Path("old/.lock").touch()

@@ -309,3 +309,10 @@ def test_the_oracle_tells_a_worker_where_object_and_goal_are(tmp_path):
     assert moved[:3].max() > 0.05 and moved[3:].max() == 0  # the puck, not its goal
     with pytest.raises(UserError, match="recorded with another positions_in_state"):
         collect(MetaWorld(), ["push"], tmp_path, episodes=1)
+
+
+def test_an_episode_may_be_longer_than_those_of_meta_world():
+    env = MetaWorldPointCloudEnv("reach", num_points=64, episode_steps=502)  # there 500
+    env.begin(0)
+    truncated = [env.advance(np.zeros(4))[1] for _ in range(502)]
+    assert truncated == [False] * 501 + [True]

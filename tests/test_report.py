@@ -112,6 +112,17 @@ def test_a_report_is_a_table_a_chart_and_every_episode_with_its_provenance(tmp_p
     assert (tmp_path / "report" / "success.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_outcomes_of_some_tasks_are_joined_to_those_of_others_all_three_kinds():
+    one = report.Outcomes({"open": [True]}, {"open": [False]}, {"open": [True]})
+    other = report.Outcomes({"close": [False]}, {"close": [False]}, {"close": [False]})
+    both = report.Outcomes({}, {}).joined(one).joined(other)
+    assert both.any_step == {"open": [True], "close": [False]}
+    assert both.at_end == {"open": [False], "close": [False]}
+    assert both.other_task == {"open": [True], "close": [False]}
+    alone = report.Outcomes({"reach": [True]}, {"reach": [True]})
+    assert report.Outcomes({}, {}).joined(alone) == alone  # None: no pairs
+
+
 # ---- Charts and pictures -------------------------------------------------------------------------
 
 

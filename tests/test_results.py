@@ -102,7 +102,7 @@ def test_readme_says_how_well_the_policy_that_ships_does_which_was_trained_by_to
     page = " ".join((ROOT / "README.md").read_text().split())  # without line breaks
     recipe = asdict(replace(preset_settings("small", "ml10"), episodes=0))  # measured afterwards
     assert run["training"]["arguments"] == recipe
-    assert run["training"]["config"]["action_error"] == PRESETS["small"].action_error
+    assert PolicyConfig(**run["training"]["config"]) == PRESETS["small"]
     for report, column in (("base", 0), ("novel", 1)):
         for part in ("successes", "successes at the end"):
             episodes = "".join(list(run[report][part].values())[column].values())

@@ -246,6 +246,8 @@ def test_a_run_that_was_resumed_ends_with_the_same_weights(point_suite, monkeypa
         (["--out", "run"], "add --resume, or another --out"),
         (["--resume", "--out", "run", "--hidden", "9"], "trained with other settings"),
         (["--resume", "--out", "damaged"], "is damaged"),
+        (["--resume", "--out", "foreign"], "is of no run of rl.py"),
+        (["--out", "results"], "already holds results: choose another --out"),
         (["--suite", "poin"], "did you mean 'point'"),
         (["--resume", "--out", "run", "--steps", "80"], "160 are taken already"),
         (["--max-kl", "-1"], "--max-kl is -1.0: use at least 0"),
@@ -255,6 +257,10 @@ def test_mistakes_are_one_line(point_suite, capsys, arguments, message):
     rl.main([*point_suite, "160", "--out", "run"])
     Path("damaged").mkdir()
     Path("damaged/last.pt").write_bytes(b"no checkpoint")
+    Path("foreign").mkdir()
+    torch.save({"model": {}}, "foreign/last.pt")
+    Path("results").mkdir()
+    Path("results/success.json").touch()
     with pytest.raises(SystemExit, match="2"):
         common.command_line(lambda: rl.main([*point_suite, "160", *arguments]))
     assert message in capsys.readouterr().err.splitlines()[-1]

@@ -742,7 +742,7 @@ def test_states_that_come_later_and_later_stop_the_arm(emulator, settings):
     with Moving(replace(settings, max_hold_s=10)) as servo:
         servo.ended.set()
         servo.thread.join()
-        servo.delay = math.inf  # the first state below is the promptest
+        servo.least_delay = math.inf  # the first state below is the promptest
         state, now = servo.rtde.state(), time.monotonic()
         with pytest.raises(RobotError, match="later than at first"):
             for tick in range(200):  # each package is delayed by 2 ms more than the one before
@@ -1427,6 +1427,8 @@ def test_a_camera_is_recorded_to_a_file_that_is_replayed(cell, capsys):
     for out in ("again", "none/again.npz"):  # said before anything is recorded
         assert ends(["camera", "--camera", "scene.npz", "--out", out]) == 2
         assert "name an .npz file in a folder that exists" in capsys.readouterr().err
+    assert ends(["camera", "--camera", "scene.npz", "--out", "a.npz", "--frames", "0"]) == 2
+    assert "--frames is 0: use at least 1" in capsys.readouterr().err
 
 
 def test_a_camera_lost_while_recording_ends_it_and_keeps_the_earlier_episodes(

@@ -201,7 +201,7 @@ def test_training_where_no_observation_tells_the_task_ends_with_what_tells_it(
     rollout_job, rollout = evaluate.rollout_job, evaluate.rollout
 
     def watched_job(**arguments):
-        measured.append((arguments["demonstration_control"], arguments["inner_steps"]))
+        measured.append((arguments["demonstration_control"], arguments["wanted"].inner_steps))
         return rollout_job(**arguments)
 
     def watched_rollout(policy, *arguments, **options):
@@ -238,17 +238,17 @@ def test_inner_steps_before_a_rollout_change_the_policy_by_its_own_rate(here, ow
     sampler = WindowSampler(load_demonstrations("data/touch-blue.npz"), policy.config)
     text = torch.zeros(512)
     steps = evaluate.take_inner_steps(
-        policy, sampler, text, steps=2, batch=4, lr=evaluate.inner_rate(info, "cpu")
+        policy, sampler, text, steps=2, batch=4, lr=evaluate.rate_of_checkpoint(info, "cpu")
     )
     (_, first_loss, _), (_, second_loss, adapted) = steps
     assert second_loss < first_loss
     assert not torch.equal(adapted.denoiser.head[1].bias, policy.denoiser.head[1].bias)
     learned = {**info, "inner_rates": {name: 0.0 for name, _ in policy.named_parameters()}}
     *_, (_, _, still) = evaluate.take_inner_steps(
-        policy, sampler, text, steps=2, batch=4, lr=evaluate.inner_rate(learned, "cpu")
+        policy, sampler, text, steps=2, batch=4, lr=evaluate.rate_of_checkpoint(learned, "cpu")
     )
     assert all(torch.equal(a, b) for a, b in zip(still.parameters(), policy.parameters()))
-    assert evaluate.inner_rate(learned, "cpu", override=0.2) == 0.2
+    assert evaluate.rate_of_checkpoint(learned, "cpu", override=0.2) == 0.2
 
 
 def test_evaluation_adapts_at_the_rate_that_is_given(here, own_folder, monkeypatch):

@@ -622,16 +622,6 @@ def dropout_settings(options):
     return settings.instruction_dropout, settings.task_dropout
 
 
-def test_the_error_is_squared_unless_another_is_asked_for():
-    def error(options):
-        return train.choose_architecture(train.parse(options.split()), "small").action_error
-
-    assert error("") == error("--policy dp3") == error("--policy mamba") == "squared"
-    assert error("--action-error huber") == "huber"
-    with pytest.raises(common.UserError, match="needs action_error 'squared'"):
-        error("--policy dp3 --action-error huber")
-
-
 def test_a_policy_that_reads_no_demonstration_keeps_its_instruction():
     """Nothing else would tell it the task; but whoever asks for the dropout gets it."""
     assert dropout_settings("") == dropout_settings("--demo-encoder mlp") == (0.2, 0.25)
