@@ -40,6 +40,7 @@ from report import (
 )
 from simulator import simulator_of
 from tests.runs import AGAIN, HIDDEN_REPORTS, REPORTS, UNNAMED_REPORTS
+from unnamed_tasks import DIRECTIONS, SCENES
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "assets" / "RESULTS.json"
@@ -142,6 +143,7 @@ class Column:
     report: str
     column: int | str = 0
     at_end: bool = False  # success at the end, not at any step
+    other_task: bool = False  # success, at any step, at the other task of a pair
 
 
 BASE, BEFORE, AFTER = Column("base"), Column("novel", "before"), Column("novel", "after")
@@ -214,6 +216,8 @@ def runs_of(results: Results, variant: str) -> list[dict]:
 def measured(run: dict, column: Column) -> Successes | None:
     """The episodes in a column of a run's report, if there is one."""
     part = "successes at the end" if column.at_end else "successes"
+    if column.other_task:
+        part = "successes at the other task"
     columns = run.get(column.report, {}).get(part, {})
     title = column.column
     if isinstance(title, int):
@@ -555,6 +559,36 @@ def hidden_summary_table(results: Results) -> str:
     return format_table(rows)
 
 
+# What is measured where no observation names the task: a title, the variant, and its report. None
+# stands for the reports of tests.runs that show a task the demonstration of another.
+UNNAMED_ROWS = (
+    ("its own demonstration", "demonstration", 0, None),
+    ("its own demonstration without the actions", "demonstration", 2, None),
+    ("another task's demonstration", "demonstration", 3, None),
+    ("zeros in place of a demonstration", "demonstration", 1, None),
+    ("no demonstration, second-order MAML: before any step", "inner", 0, "0-steps"),
+    ("the same, after one inner step", "inner", 0, "1-steps"),
+    ("the same, after five inner steps", "inner", 0, "5-steps"),
+    ("multi-task training", "neither", 0, "multi-task"),
+)
+
+
+def pairs_table(results: Results) -> str:
+    """A row for what a policy has; success at its task and at the other one, by scene."""
+    head_cells = [f"{scene}, {which}" for scene in SCENES for which in ("its task", "the other")]
+    rows = [["success at any step, percent", *head_cells]]
+    for title, variant, place, report in UNNAMED_ROWS:
+        cells = []
+        for scene in SCENES:
+            tasks = [f"{scene}-{direction}-hidden" for direction in DIRECTIONS]
+            for other_task in (False, True):
+                column = Column(report or scene, place, other_task=other_task)
+                cells.append(pooled(results, f"pairs-{variant}", column, tasks))
+        if any(cells):
+            rows.append([title, *cells])
+    return format_table(rows)
+
+
 TABLES: dict[str, Callable[[Results], str]] = {
     "means": means_table,
     "base": lambda results: by_task_table(results, "base"),
@@ -575,6 +609,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
     "goals push": lambda results: hidden_goals_table(results, "push"),
     "goals pick-place": lambda results: hidden_goals_table(results, "pick-place"),
+    "pairs": pairs_table,
     "swap": swap_table,
     "reading": reading_table,
 }

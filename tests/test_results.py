@@ -12,13 +12,27 @@ from model import PRESETS, PolicyConfig
 from report import wilson_interval
 from simulator import SIMULATORS
 from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
-from tests.runs import HIDDEN_METHOD, HIDDEN_REPORTS, LIMITS, LONGER, SEED, TUNING, VARIANTS
+from tests.runs import (
+    HIDDEN_METHOD,
+    HIDDEN_REPORTS,
+    LIMITS,
+    LONGER,
+    SEED,
+    TUNING,
+    UNNAMED_METHOD,
+    UNNAMED_REPORTS,
+    UNNAMED_SUITES,
+    VARIANTS,
+)
 from train import SETTINGS, Settings, parse, preset_settings
 
 HELD = json.loads(RESULTS.read_text())
 HIDDEN = {name: run for name, run in HELD.items() if name.startswith("goals-")}
+UNNAMED = {name: run for name, run in HELD.items() if name.startswith(UNNAMED_SUITES)}
 SHIPPED = "ml10-small-seed0"
-ML = {name: run for name, run in HELD.items() if name not in HIDDEN and name != SHIPPED}
+ML = {
+    name: run for name, run in HELD.items() if name not in {*HIDDEN, *UNNAMED} and name != SHIPPED
+}
 
 # RESULTS.json keeps every record as it was written, with the names that were used that day. These
 # have another one today.
@@ -150,6 +164,19 @@ def check_training(name, suite, flags):
             assert {**arguments, **config}[flag] == value, (name, flag)
     assert arguments["seed"] == int(name[-1]) and arguments["suite"] == suite
     assert {"command", "hardware", "minutes"} <= set(training)
+
+
+def test_runs_on_tasks_without_a_name_are_those_of_the_queue():
+    for name, run in UNNAMED.items():
+        suite, variant = re.fullmatch(rf"({'|'.join(UNNAMED_SUITES)})-(.+)-seed\d", name).groups()
+        check_training(name, suite, UNNAMED_METHOD[variant])
+        for part in run:
+            if part == "training":
+                continue
+            assert variant in UNNAMED_REPORTS[suite][part][1]
+            assert run[part]["provenance"]["seed"] == SEED
+            for tasks in run[part]["successes"].values():
+                assert {len(digits) for digits in tasks.values()} == {20}
 
 
 def test_runs_on_hidden_goals_are_those_of_the_queue_and_say_how_they_were_measured():
