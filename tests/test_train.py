@@ -717,17 +717,17 @@ def test_rates_may_be_learned_after_a_training_that_had_no_inner_step_so_far(
 
 
 def test_inner_steps_on_held_out_episodes_are_taken_with_the_learned_rates(pair, monkeypatch):
-    adapt, used = train.adapt, []
+    take_inner_steps, used = evaluate.take_inner_steps, []
 
-    def watched(loss_fn, params, batch, lr, steps):
+    def watched(*arguments, lr, **options):
         used.append(lr)
-        return adapt(loss_fn, params, batch, lr, steps)
+        return take_inner_steps(*arguments, lr=lr, **options)
 
-    monkeypatch.setattr(train, "adapt", watched)
+    monkeypatch.setattr(evaluate, "take_inner_steps", watched)
     options = "--steps 2 --held-out 1 --learn-inner-lr --rate-lr 1 --out run".split()
     train.main([*SHORT, "--data", str(pair), *options])
     rates = weights("run/ema-00002.pt")[1]["inner_rates"]
-    assert len(used) == 4  # two tasks, one step and five
+    assert len(used) == 2  # tasks
     for lr in used:
         assert {name: rate.item() for name, rate in lr.items()} == rates
 

@@ -321,7 +321,7 @@ def test_recordings_keep_what_ends_in_success_and_are_never_augmented(turned):
     for suite in ("convention-reach", "convention-push"):
         settings = replace(train.SETTINGS["small"], suite=suite, **train.SUITE_SETTINGS[suite])
         assert not settings.augment and settings.instruction_dropout == 0
-        assert (settings.demonstrations, settings.tasks_per_step) == (8, 16)
+        assert (settings.demonstrations, settings.tasks_per_step) == (8, None)
         assert (settings.evaluate_on, CONVENTIONS.demonstrations) == ("novel", 5)
     settings = replace(train.SETTINGS["small"], **train.SUITE_SETTINGS["pairs"])
     assert (settings.instruction_dropout, settings.evaluate_on) == (0, "base")
