@@ -638,9 +638,10 @@ def preset(policy: str, size: str, **changes: Any) -> PolicyConfig:
     return replace(model.PRESETS[size], policy=policy, **required, **changes)
 
 
+SHORT_CHUNKS = {"horizon": 4, "n_action_steps": 3}  # of FlowPolicy and Mamba Policy
+
 # The configurations by policy and preset. `paper`: as the published code is run; `small`: about
 # 3 million parameters, as many as DAMI's.
-SHORT = {"horizon": 4, "n_action_steps": 3}  # the chunks of FlowPolicy and Mamba Policy
 PRESETS = {
     "dami": model.PRESETS,
     "dp3": {
@@ -649,14 +650,14 @@ PRESETS = {
         "tiny": preset("dp3", "tiny"),
     },
     "flow": {
-        "paper": preset("flow", "paper", **SHORT),
-        "small": preset("flow", "small", **SHORT, unet_widths=(48, 96, 192)),
-        "tiny": preset("flow", "tiny", **SHORT),
+        "paper": preset("flow", "paper", **SHORT_CHUNKS),
+        "small": preset("flow", "small", **SHORT_CHUNKS, unet_widths=(48, 96, 192)),
+        "tiny": preset("flow", "tiny", **SHORT_CHUNKS),
     },
     "mamba": {
-        "paper": preset("mamba", "paper", **SHORT, unet_widths=(128, 256, 512)),
-        "small": preset("mamba", "small", **SHORT, unet_widths=(32, 64, 112)),
-        "tiny": preset("mamba", "tiny", **SHORT),
+        "paper": preset("mamba", "paper", **SHORT_CHUNKS, unet_widths=(128, 256, 512)),
+        "small": preset("mamba", "small", **SHORT_CHUNKS, unet_widths=(32, 64, 112)),
+        "tiny": preset("mamba", "tiny", **SHORT_CHUNKS),
     },
     "freq": {
         "paper": preset("freq", "paper", unet_widths=(512, 1024)),

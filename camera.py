@@ -48,7 +48,7 @@ def drawn_colors(model: mujoco.MjModel, kind: str, groups: Sequence[int]) -> np.
             textures[index] = texels[::16, :3].mean(axis=0) / 255
 
     colors = rgba.astype(np.float64)
-    # This is MuJoCo's default; where there is a material, that has the color.
+    # An object that names no color has this one; if it has a material, that is drawn instead.
     undefined = (rgba == (0.5, 0.5, 0.5, 1)).all(axis=1) & (material >= 0)
     colors[undefined] = model.mat_rgba[material[undefined]]
     colors[:, :3] *= textures[material]

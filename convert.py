@@ -721,6 +721,7 @@ def natural(file: Path) -> list[int]:
 
 
 def read_all_json_lines(path: Path) -> list[dict[str, Any]]:
+    """The objects of a file, one a line; RecordingError where a line is none."""
     try:
         return [dict(json.loads(line)) for line in path.read_text().splitlines() if line.strip()]
     except (TypeError, ValueError) as error:
@@ -1382,7 +1383,8 @@ def import_recordings(args: argparse.Namespace) -> None:
     if not path.exists():
         refuse(path, "is missing: look at --import")
     options = read_options(args)
-    source = reader_of(path)(path, options)
+    read = reader_of(path)
+    source = read(path, options)
     tasks, notes = assemble(
         path, source, options, num_points=args.num_points, incomplete=args.incomplete
     )

@@ -146,7 +146,10 @@ class Demonstrations:
         return self.part(0, n)
 
     def part(self, first: int, stop: int) -> "Demonstrations":
-        """Returns the episodes from `first` up to, but without, `stop` (views, no copies)."""
+        """Returns the episodes from `first` up to, but without, `stop` (views, no copies).
+
+        At least one, of those that there are.
+        """
         start, end = self.episode(first).start, self.episode(stop - 1).stop
         meta = dict(self.meta)
         if "success_frames" in meta:
@@ -534,9 +537,9 @@ def suspect_shifted_actions(demonstrations: Demonstrations) -> list[str]:
 
     An action may be a velocity or a displacement, or else a target position, whose own change from
     the frame before is then what counts. Both are compared with the change of the state that
-    follows. Nothing moves before it is told to,
-    so a negative lag is a mistake. A positive one may be that of the controller, which spreads over
-    several frames: only one that is nearly perfect is suspected.
+    follows. Nothing moves before it is told to, so a negative lag is a mistake. A positive one may
+    be that of the controller, which spreads over several frames: only one that is nearly perfect is
+    suspected.
     """
     margin = max(LAGS)
     actions, changes = [], {lag: [] for lag in LAGS}
@@ -870,7 +873,7 @@ class WindowSampler:
         """Draws a reference demonstration, and n windows of other episodes where there are any.
 
         The first `support` windows are of other episodes than the rest, where there are enough.
-        Otherwise the loss of the rest could fall in an inner step because it has seen them.
+        From the same ones, an inner step could lower the loss of the rest by having seen them.
         """
         reference = self.sample_episode(generator)
         demo = self.demonstration(reference)

@@ -459,7 +459,7 @@ def keep_policy_of_task(wanted: PolicyOfTask) -> tuple[DAMIPolicy, WindowSampler
             lr=rate_of_checkpoint(info, wanted.device, wanted.inner_lr),
         )
         for _, _, adapted in of_each_step:
-            policy = adapted
+            policy = adapted  # in the end, that after the last step
     return policy, sampler, text
 
 

@@ -37,9 +37,10 @@ SKILLS = ("reach", "push", "pick-place")
 # them: reach-goal-07, reach-validation-07, reach-novel-07.
 GOALS = {"goal": 320, "validation": 10, "novel": 20}
 
-# Where goals lie: in this box, and so far from the middle of where objects begin, horizontally.
+# Where goals lie: in this box, and so far from the middle of where objects begin, horizontally. The
+# least distance, less the farthest that an object begins from there, exceeds Meta-World's 0.15.
 GOAL_LOW, GOAL_HIGH = (-0.30, 0.50, 0.05), (0.30, 0.90, 0.30)
-GOAL_DISTANCE = (0.21, 0.32)  # less OBJECT_SPREAD more than 0.15, or a start may be rejected
+GOAL_DISTANCE = (0.21, 0.32)
 ON_TABLE = 0.02  # the height of the goals of push
 
 # Where the object begins, at most so far from a middle, and the box in which the hand begins.

@@ -230,7 +230,10 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         self.resting_place = None
 
     def reset_simulation(self, seed: int) -> np.ndarray:
-        """Puts everything where the episode of this seed begins; returns what the expert reads."""
+        """Puts everything where the episode of this seed begins.
+
+        Returns what the expert reads, Meta-World's own observation (39,) float64.
+        """
         self.sawyer_env.seed(seed)
         expert_observation, _ = self.sawyer_env.reset()
         # Moves the goal markers to this episode's goal: they are still where the last one had them.

@@ -37,8 +37,8 @@ class Outcomes:
     other_task: Successes | None = None  # whether any step did the other task of a pair
 
     def joined(self, others: "Outcomes") -> "Outcomes":
-        """These and those of other tasks; both were measured at the end, too."""
-        other_task = {**(self.other_task or {}), **(others.other_task or {})}
+        """Returns these and those of other tasks together; both have `at_end`."""
+        other_task = (self.other_task or {}) | (others.other_task or {})
         return Outcomes(
             any_step=self.any_step | others.any_step,
             at_end=self.at_end | others.at_end,

@@ -492,6 +492,9 @@ class Run:
     seconds: float = 0.0  # that they took
 
 
+SAVED = {"suite", "settings", "shape", "weights", "iteration", "seconds"}
+
+
 def save(path: Path, run: Run, settings: Settings, suite: str) -> None:
     """Writes all that a run needs to go on."""
     content = {
@@ -517,7 +520,7 @@ def restore(path: Path, settings: Settings, suite: str) -> Run:
         saved = torch.load(path, weights_only=True)
     except Exception as error:  # torch.load raises many kinds for a damaged file
         raise UserError(f"{path} is damaged: train again, with another --out") from error
-    if not isinstance(saved, dict) or "shape" not in saved:
+    if not isinstance(saved, dict) or not SAVED <= saved.keys():
         raise UserError(f"{path} is of no run of rl.py: look at --out")
     policy = GaussianPolicy(*saved["shape"])
     policy.load_state_dict(saved["weights"])

@@ -130,7 +130,10 @@ class PairEnv(MetaWorldPointCloudEnv):
         self.other_successes = []
 
     def reset_simulation(self, seed: int) -> np.ndarray:
-        """Puts everything where the episode of this seed begins; returns what the expert reads."""
+        """Puts everything where the episode of this seed begins.
+
+        Returns what the expert reads, Meta-World's own observation (39,) float64.
+        """
         object_start, hand = pair_start(self.scene, seed)
         # Both tasks are told where the object begins, since their goals follow from that.
         for env in (self.other_env, self.sawyer_env):

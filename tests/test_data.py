@@ -1,5 +1,6 @@
 """Tests of data.py against naive implementations, and with files that are wrong in many ways."""
 
+import errno
 import json
 import os
 import re
@@ -247,6 +248,7 @@ UNSAVABLE = [
     ({"points": np.full((30, 16, 3), 900, np.float16)}, "write them in metres"),
     ({"meta": {"positions_in_state": np.int64(4)}}, "positions_in_state is 4, a state has 9 numb"),
     ({"meta": {"made_by": b"me"}}, "meta must hold what JSON can, made_by: bytes"),
+    ({"meta": {("made", "by"): "me"}}, r"the names in meta must be text, not \('made', 'by'\)"),
     ({"meta": {"simulator": 3}}, "simulator must be a name, not 3"),
 ]
 
@@ -382,6 +384,16 @@ def test_a_file_with_bad_contents_is_refused_in_one_line(tmp_path, parts, messag
     with pytest.raises(RecordingError, match=message) as caught:
         data.load_demonstrations(path)
     assert "\n" not in str(caught.value) and "reach.npz" in str(caught.value)
+
+
+def test_a_file_that_may_not_be_read_is_refused_in_one_line(tmp_path, monkeypatch):
+    def forbidden(_):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    data.save_demonstrations(tmp_path / "reach.npz", recording())
+    monkeypatch.setattr(data.zipfile, "is_zipfile", forbidden)  # root may read any file
+    with pytest.raises(RecordingError, match=r"reach\.npz cannot be read: Permission denied"):
+        data.load_demonstrations(tmp_path / "reach.npz")
 
 
 def test_a_missing_truncated_or_foreign_file_is_refused_in_one_line(tmp_path):

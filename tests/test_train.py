@@ -486,6 +486,25 @@ def test_ctrl_c_saves_says_how_to_resume_and_ends_with_130(
     assert same_bits(whole_state(out), whole_state(finished))
 
 
+def test_success_at_the_other_task_of_a_pair_is_kept_when_a_finished_run_is_resumed(
+    bowl, tmp_path, monkeypatch
+):
+    def of_pairs(recordings, episodes, **_):
+        won, lost = ({task: [x] * episodes for task in recordings} for x in (True, False))
+        return report.Outcomes(won, won, other_task=lost)
+
+    argv = [*bowl, "--out", str(tmp_path / "run")]
+    monkeypatch.setattr(evaluate, "evaluate_checkpoint", of_pairs)
+    train.main(argv)
+    written = json.loads((tmp_path / "run/success.json").read_text())
+    monkeypatch.setattr(evaluate, "evaluate_checkpoint", None)  # what is logged is not done again
+    train.main([*argv, "--resume"])
+    again = json.loads((tmp_path / "run/success.json").read_text())
+    for part in ("successes", "successes at the end", "successes at the other task"):
+        assert again[part] == written[part] != {}
+    assert again["successes at the other task"] != again["successes"]
+
+
 def test_a_run_stopped_while_it_is_evaluated_is_evaluated_when_resumed(
     bowl, tmp_path, monkeypatch, capsys
 ):
@@ -717,17 +736,25 @@ def test_rates_may_be_learned_after_a_training_that_had_no_inner_step_so_far(
 
 
 def test_inner_steps_on_held_out_episodes_are_taken_with_the_learned_rates(pair, monkeypatch):
-    take_inner_steps, used = evaluate.take_inner_steps, []
+    take_inner_steps, used, taken = evaluate.take_inner_steps, [], []
 
     def watched(*arguments, lr, **options):
         used.append(lr)
-        return take_inner_steps(*arguments, lr=lr, **options)
+        for after_step in take_inner_steps(*arguments, lr=lr, **options):
+            taken.append(after_step[0])
+            yield after_step
 
     monkeypatch.setattr(evaluate, "take_inner_steps", watched)
     options = "--steps 2 --held-out 1 --learn-inner-lr --rate-lr 1 --out run".split()
     train.main([*SHORT, "--data", str(pair), *options])
     rates = weights("run/ema-00002.pt")[1]["inner_rates"]
-    assert len(used) == 2  # tasks
+    assert len(used) == 2 and taken == 2 * [1, 2, 3, 4, 5]  # of each of two tasks
+    table = Path("run/held-out.md").read_text()
+    after_one, after_five = (
+        next(line for line in table.splitlines() if title in line).split("|")[2:]
+        for title in ("after 1 inner step ", "after 5 inner steps ")
+    )
+    assert after_one != after_five
     for lr in used:
         assert {name: rate.item() for name, rate in lr.items()} == rates
 
