@@ -138,7 +138,11 @@ SHOWN = {  # a suite -> the columns of its tables: a variant, and what it is cal
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a report (a name of `tests.runs.REPORTS`), by its name or its place."""
+    """A column of a report (a name of `tests.runs.REPORTS`).
+
+    It is told by its place or by its name: the whole of it, or what stands in it behind a
+    checkpoint and a comma, such as "zeros".
+    """
 
     report: str
     column: int | str = 0
@@ -224,9 +228,10 @@ def measured(run: dict, column: Column) -> Successes | None:
         if not columns:
             return None
         title = list(columns)[title]
-    if title not in columns:
-        return None
-    return {task: [c == "1" for c in episodes] for task, episodes in columns[title].items()}
+    for name, tasks in columns.items():
+        if name == title or name.endswith(f", {title}"):
+            return {task: [c == "1" for c in episodes] for task, episodes in tasks.items()}
+    return None
 
 
 def on_all_goals(run: dict, column: Column) -> Successes | None:
@@ -483,15 +488,17 @@ def looks_table(results: Results) -> str:
     return format_table(rows)
 
 
+SHOWN_ANOTHER = "demonstration of another task"  # as reports of `evaluate.py --swap` call it
+
 # What is measured on goals that no observation tells: a title, the variant, and its report.
 HIDDEN_ROWS = (
     ("with the goal's own demonstration", "demonstration", Column("novel", 0)),
     ("the same, from 20 starts", "demonstration", Column("starts")),
-    ("with another goal's", "demonstration", Column("novel", 2)),
-    ("with zeros in its place", "demonstration", Column("novel", 1)),
-    ("with its last frame alone", "demonstration", Column("parts", 1)),
-    ("without its actions", "demonstration", Column("parts", 2)),
-    ("with its frames in another order", "demonstration", Column("parts", 3)),
+    ("with another goal's", "demonstration", Column("novel", SHOWN_ANOTHER)),
+    ("with zeros in its place", "demonstration", Column("novel", "zeros")),
+    ("with its last frame alone", "demonstration", Column("parts", "last-frame")),
+    ("without its actions", "demonstration", Column("parts", "no-actions")),
+    ("with its frames in another order", "demonstration", Column("parts", "shuffled")),
     (
         "with the goal's own, trained at twice the learning rate",
         "demonstration-twice-the-rate",
@@ -499,7 +506,7 @@ HIDDEN_ROWS = (
     ),
     ("second order: before any step", "inner", Column("0-steps")),
     ("second order: 1 inner step", "inner", Column("1-steps")),
-    ("second order: 1 inner step on another goal", "inner", Column("1-steps-swap", 1)),
+    ("second order: 1 inner step on another goal", "inner", Column("1-steps-swap", SHOWN_ANOTHER)),
     ("second order: 5 inner steps", "inner", Column("5-steps")),
     ("second order: 20 inner steps", "inner", Column("20-steps")),
     ("first order: before any step", "inner-first-order", Column("0-steps")),
@@ -559,17 +566,17 @@ def hidden_summary_table(results: Results) -> str:
     return format_table(rows)
 
 
-# What is measured where no observation names the task: a title, the variant, and its report. None
-# stands for the reports of tests.runs that show a task the demonstration of another.
-UNNAMED_ROWS = (
-    ("its own demonstration", "demonstration", 0, None),
-    ("its own demonstration without the actions", "demonstration", 2, None),
-    ("another task's demonstration", "demonstration", 3, None),
-    ("zeros in place of a demonstration", "demonstration", 1, None),
-    ("no demonstration, second-order MAML: before any step", "inner", 0, "0-steps"),
-    ("the same, after one inner step", "inner", 0, "1-steps"),
-    ("the same, after five inner steps", "inner", 0, "5-steps"),
-    ("multi-task training", "neither", 0, "multi-task"),
+# What is measured on pairs: a title, the variant, its report, and the column of that. None: the
+# report of each scene, in which a task is also shown the demonstration of the other one.
+PAIRS_ROWS = (
+    ("its own demonstration", "demonstration", None, 0),
+    ("its own demonstration without the actions", "demonstration", None, "no-actions"),
+    ("another task's demonstration", "demonstration", None, SHOWN_ANOTHER),
+    ("zeros in place of a demonstration", "demonstration", None, "zeros"),
+    ("no demonstration, second-order MAML: before any step", "inner", "0-steps", 0),
+    ("the same, after one inner step", "inner", "1-steps", 0),
+    ("the same, after five inner steps", "inner", "5-steps", 0),
+    ("multi-task training", "neither", "multi-task", 0),
 )
 
 
@@ -577,12 +584,12 @@ def pairs_table(results: Results) -> str:
     """A row for what a policy has; success at its task and at the other one, by scene."""
     head_cells = [f"{scene}, {which}" for scene in SCENES for which in ("its task", "the other")]
     rows = [["success at any step, percent", *head_cells]]
-    for title, variant, place, report in UNNAMED_ROWS:
+    for title, variant, report, shown in PAIRS_ROWS:
         cells = []
         for scene in SCENES:
             tasks = [f"{scene}-{direction}-hidden" for direction in DIRECTIONS]
             for other_task in (False, True):
-                column = Column(report or scene, place, other_task=other_task)
+                column = Column(report or scene, shown, other_task=other_task)
                 cells.append(pooled(results, f"pairs-{variant}", column, tasks))
         if any(cells):
             rows.append([title, *cells])

@@ -7,11 +7,24 @@ from dataclasses import asdict, fields, replace
 import numpy as np
 import pytest
 
-from hidden_goals import names_of
+from hidden_goals import SKILLS, names_of
 from model import PRESETS, PolicyConfig
 from report import wilson_interval
 from simulator import SIMULATORS
-from tests.results import POLICIES, RESULTS, ROOT, TABLES, TASKS, compare, fill, runs_of
+from tests.results import (
+    HIDDEN_ROWS,
+    PAIRS_ROWS,
+    POLICIES,
+    RESULTS,
+    ROOT,
+    TABLES,
+    TASKS,
+    Column,
+    compare,
+    fill,
+    measured,
+    runs_of,
+)
 from tests.runs import (
     HIDDEN_METHOD,
     HIDDEN_REPORTS,
@@ -25,6 +38,7 @@ from tests.runs import (
     VARIANTS,
 )
 from train import SETTINGS, Settings, parse, preset_settings
+from unnamed_tasks import SCENES
 
 HELD = json.loads(RESULTS.read_text())
 HIDDEN = {name: run for name, run in HELD.items() if name.startswith("goals-")}
@@ -172,6 +186,37 @@ def check_training(name, suite, flags):
             assert {**arguments, **config}[flag] == value, (name, flag)
     assert arguments["seed"] == int(name[-1]) and arguments["suite"] == suite
     assert {"command", "hardware", "minutes"} <= set(training)
+
+
+def test_a_column_is_found_by_its_place_by_its_name_and_by_what_stands_behind_the_checkpoint():
+    columns = {"r/ema-1": "11", "r/ema-1, zeros": "00", "r/ema-1, no-actions": "01", "before": "10"}
+    run = {"novel": {"successes": {name: {"reach": won} for name, won in columns.items()}}}
+    for told, won in {0: "11", "zeros": "00", "no-actions": "01", "before": "10"}.items():
+        assert measured(run, Column("novel", told)) == {"reach": [c == "1" for c in won]}
+    for absent in ("actions", "r/ema", "shuffled"):
+        assert measured(run, Column("novel", absent)) is None
+    assert measured(run, Column("starts")) is None
+
+
+def test_a_report_has_the_columns_that_tables_show_of_it():
+    shown = [
+        (f"goals-{skill}-{variant}", column)
+        for _, variant, column in HIDDEN_ROWS
+        for skill in SKILLS
+    ]
+    shown += [
+        (f"pairs-{variant}", Column(report or scene, told, other_task=other_task))
+        for _, variant, report, told in PAIRS_ROWS
+        for scene in SCENES
+        for other_task in (False, True)
+    ]
+    found = 0
+    for variant, column in shown:
+        for run in runs_of(HELD, variant):
+            if column.report in run:
+                assert measured(run, column) is not None, (variant, column)
+                found += 1
+    assert found > 50
 
 
 def test_runs_on_tasks_without_a_name_are_those_of_the_queue():
