@@ -86,7 +86,7 @@ class FlowPolicy(DP3Policy):
     observations on.
     """
 
-    # Its sampler is its own, so there is no choice.
+    # `sample_actions` draws in its own way, and reads no sampler: one value is enough.
     requires: ClassVar = {**DP3Policy.requires, "sampler": "ddim"}
 
     START = 0.01  # of t
@@ -301,7 +301,8 @@ class MambaPolicy(DP3Policy):
     multiplied by 5 / 4 for the others (stochastic depth).
 
     Left open: the publication describes the attention; the configurations that come with its code
-    build it and do not run it. Here it runs. Widths, kernel and horizon are that code's.
+    build it and do not run it. Here it runs, and its queries, keys and values have a bias, as
+    elsewhere in this project. Widths, kernel and horizon are that code's.
     """
 
     requires: ClassVar = {**DP3Policy.requires, "denoiser": "mamba-unet"}
@@ -504,6 +505,8 @@ class FreqPolicy(DP3Policy):
     separately, and has gated MLPs); the share of hidden places is drawn for each window (there: for
     each batch); the head learns the noise and no variance, reads c / H, and takes ten deterministic
     DDIM steps (`small`: five) whose clean action is clipped (there: ten random ones, unclipped).
+    Within the head, the cut-off is added to the condition (there: concatenated), and timestep
+    features, initialization and LayerNorms, which have no weights, are this project's.
     """
 
     requires: ClassVar = {
@@ -514,8 +517,7 @@ class FreqPolicy(DP3Policy):
     conditioned_by_h = False  # its network embeds timesteps and observations itself
 
     ROUNDS = 4
-    LEAST_HIDDEN = 0.7  # the share of hidden places is normal around 1, cut to [0.7, 1] ...
-    DEVIATION = 0.25  # ... with this standard deviation
+    LEAST_HIDDEN, DEVIATION = 0.7, 0.25  # of the share of hidden places, see below
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
         """Draws noise (n, H, A), timesteps (n, H), cutoffs (n,), mask (n, H) of n windows."""

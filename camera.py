@@ -206,10 +206,11 @@ class RayCastCamera:
     def pose(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
         """Returns the camera's position (3,) and axes (3, 3), world frame, metres.
 
-        The axes are columns: right, up, backward. Raises ValueError for the data of another model,
-        and where no poses were computed yet.
+        The axes are columns: right, up, backward. Raises ValueError for the data of a model with
+        another number of geoms or sites, and where no poses were computed yet.
         """
-        if data.geom_xpos.shape != self.view.geom_pos.shape:
+        sizes = len(data.geom_xpos), len(data.site_xpos)
+        if sizes != (self.view.ngeom, self.view.nsite):
             raise ValueError("the data is of another model than the camera")
         if not data.xmat[0].any():  # the world's, which never turns
             raise ValueError("the data has no poses yet: call mujoco.mj_forward(model, data) first")
@@ -255,7 +256,8 @@ class RayCastCamera:
                 point's geom, or the number of geoms plus the index of its site.
 
         Raises:
-            ValueError: the data is of another model, or has no poses yet.
+            ValueError: the data is of a model with another number of geoms or sites, or has no
+                poses yet.
         """
         origin, axes = self.pose(data)
         rays = self.rays @ axes.T  # (H * W, 3), from the camera's frame to the world's

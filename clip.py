@@ -282,7 +282,8 @@ HUGGING_FACE_NAMES = {
 def as_openai_names_them(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     """Renames the text tensors of a Hugging Face CLIP model; other state dicts stay as they are.
 
-    `CLIPModel`, `CLIPTextModel` and `CLIPTextModelWithProjection` name them alike.
+    `CLIPModel` and `CLIPTextModelWithProjection` name them alike. A bare `CLIPTextModel` lacks the
+    projection behind the tower, and is refused later.
     """
     if not any(name.startswith("text_model.") for name in weights):
         return weights
@@ -393,7 +394,8 @@ def load_clip_text_encoder(
     Args:
         weights: OpenAI's ViT-B-32.pt, a plain state dict with its names or Hugging Face's, or
             "random".
-        seed: draws the random weights, used with a warning where the official ones cannot be had.
+        seed: of the random weights, which are used if "random" is given, and with a warning where
+            the official ones cannot be had.
         download: False keeps off the network.
 
     Returns:
@@ -401,8 +403,8 @@ def load_clip_text_encoder(
         "random-seed-<seed>".
 
     Raises:
-        TextWeightsError: the file (given, cached or downloaded) is missing, cut off or not the
-            official archive, or it lacks a tensor.
+        TextWeightsError: the file is missing, cut off, or lacks a tensor; or the one that is cached
+            or downloaded is not the official archive.
     """
     if weights == "random":
         return random_clip_text_encoder(seed)

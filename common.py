@@ -314,7 +314,8 @@ def locked(
     Args:
         folder, name: of the lock's file.
         flag: names the folder on the command line.
-        waiting: is printed, and then another process is waited for; None: that is refused.
+        waiting: printed before waiting for the process that has the lock; None: nobody waits, and
+            UserError is raised.
 
     Raises:
         UserError: another process has the lock, or the folder cannot be written to.
@@ -347,7 +348,7 @@ class StopRequest:
                     save()
                     raise KeyboardInterrupt("saved")
 
-    A second one stops at once. Inside `stop.suspended()` the first one does, too.
+    A second signal stops at once. Inside `stop.suspended()` the first one does so.
     """
 
     def __init__(self) -> None:

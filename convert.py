@@ -117,9 +117,9 @@ def read_json(path: Path) -> dict[str, Any]:
 class Camera:
     """What the JSON file of --camera may hold.
 
-    Without a pose points stay in their own frame, which is that of the camera for depth: right,
-    down, forward. The positions in a state must be in the frame of the points. What stands here
-    comes before what the data set says.
+    Without a pose, here or in the data set, points stay in their own frame, which is that of the
+    camera for depth: right, down, forward. The positions in a state must be in the frame of the
+    points. What stands here comes before what the data set says.
     """
 
     intrinsics: list | None = None  # fx, fy, cx, cy of the depth image, pixels
@@ -537,12 +537,14 @@ class LeRobot:
     def is_picture(self, name: str) -> bool:
         return self.features[name]["dtype"] in ("video", "image")
 
+    def info_of(self, name: str) -> dict[str, Any]:
+        """What the dataset says of a picture or video."""
+        feature = self.features[name]
+        return {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
+
     def depth_info(self, name: str) -> dict[str, Any] | None:
         """What the dataset says of a depth map; None for a feature that is none."""
-        info = {
-            **(self.features[name].get("video_info") or {}),
-            **(self.features[name].get("info") or {}),
-        }
+        info = self.info_of(name)
         return info if info.get("is_depth_map") or info.get("video.is_depth_map") else None
 
     def read_quantizer(self) -> dict[str, float]:
@@ -570,11 +572,17 @@ class LeRobot:
         A video is decoded to metres, by what lerobot took for the unit of the depth it was given.
         If --camera names another unit, depth is multiplied by the ratio of that unit to lerobot's.
         """
-        stated = (self.features[self.cloud].get("info") or {}).get("depth_unit")
+        stated = self.info_of(self.cloud).get("depth_unit")
         if not self.is_video(self.cloud):
             return unit_in_metres(self.path, self.cloud, stated, self.camera)
         if self.camera.depth_scale is None:
             return 1.0
+        if stated is None:
+            refuse(
+                self.path / "meta" / "info.json",
+                f"does not say the depth_unit of {self.cloud}, with which another unit could be "
+                "compared: leave out --depth-unit and depth_scale",
+            )
         return self.camera.depth_scale / unit_in_metres(self.path, self.cloud, stated, Camera())
 
     def choose_intrinsics(self) -> str | None:
@@ -990,7 +998,7 @@ class HDF5:
         color = pose = None
         if self.color is not None:
             color = color_image(self.path, self.color, row[self.color], depth)
-        if self.extrinsics is not None:  # from base to camera, (3, 4) or (4, 4)
+        if self.extrinsics is not None:  # from world to camera, (3, 4) or (4, 4)
             pose = np.linalg.inv(np.vstack([row[self.extrinsics][:3], [0, 0, 0, 1]]))
         intrinsics = self.camera.intrinsics
         if intrinsics is None:
@@ -1383,6 +1391,9 @@ def import_recordings(args: argparse.Namespace) -> None:
     if not path.exists():
         refuse(path, "is missing: look at --import")
     options = read_options(args)
+    out = Path(args.out or "recordings")
+    if args.task and (out / f"{args.task}.npz").exists():  # before all is read
+        refuse(out / f"{args.task}.npz", "already exists: move it, or use another --task or --out")
     read = reader_of(path)
     source = read(path, options)
     tasks, notes = assemble(
@@ -1403,7 +1414,7 @@ def import_recordings(args: argparse.Namespace) -> None:
         meta["positions_in_state"] = args.positions_in_state
     recordings = {}
     for name, episodes in zip(task_names(tasks, args.task), tasks):
-        file = Path(args.out or "recordings") / f"{name}.npz"
+        file = out / f"{name}.npz"
         if file.exists():
             other = "another --out" if len(tasks) > 1 else "another --task or --out"
             refuse(file, f"already exists: move it, or use {other}")
@@ -1515,7 +1526,7 @@ POSITIONS_HELP = (
     "how many points x, y, z a state begins with, in metres and in the frame of the points: 1 for "
     "a pose (x, y, z, then a rotation and a gripper) whose actions begin with the change of x, y, "
     "z; 0 for joint angles, or if unsure. Augmentation moves these with the points; rotations stay "
-    "as they are, wrong by up to 10 degrees (0; of RLBench 1, and rotations turn with the points)"
+    "as they are, wrong by up to 16 degrees (default: 0; for RLBench 1, whose rotations turn, too)"
 )
 
 

@@ -79,10 +79,10 @@ class Demonstrations:
 
     - positions_in_state: k, where the first 3 k numbers of a state are k positions x, y, z in the
       frame of the points, and the first three of an action are a change of the first position.
-      A pose of seven numbers that begins with x, y, z has 1; joint angles have 0. Only such scenes
-      can be augmented: points, positions and displacement turn by up to 10 degrees together. An
+      A pose of seven numbers that begins with x, y, z has 1; joint angles have 0. Only scenes with
+      1 or more can be augmented: points, positions and displacement turn and stretch together. An
       orientation in the state or the action turns with them where rotation_near_rad is there;
-      otherwise it stays as it is, and so is wrong by that much.
+      otherwise it stays as it is, and so is wrong by up to 16 degrees.
     - rotation_near_rad: three numbers, where positions_in_state is 1 and the next three numbers of
       a state are a rotation vector in the frame of the points, of its two forms the nearer to this
       one; those of an action are a rotation in that frame, applied after the present one. robot.py
@@ -178,7 +178,8 @@ class Demonstrations:
         """Files can be named by the task."""
         if not re.fullmatch(NAME, self.task):
             raise RecordingError(
-                f"task {self.task[:100]!r} is no name of letters, digits, '-', '_' and '.'"
+                f"task {self.task[:100]!r} is no name of at most 100 letters, digits, '-', '_' and "
+                "'.' that begins with a letter, a digit or '_'"
             )
 
     def check_shapes(self) -> None:
@@ -297,13 +298,14 @@ class Demonstrations:
         if "success_frames" not in meta:
             return
         frames = meta["success_frames"]
-        if (
-            not isinstance(frames, list)
-            or len(frames) != len(self)
-            or any(type(frame) is not int or frame < 0 for frame in frames)
+        if not isinstance(frames, list) or any(type(frame) is not int for frame in frames):
+            raise RecordingError("success_frames must be a list of whole numbers")
+        lengths = np.diff(self.episode_ends, prepend=0)
+        if len(frames) != len(lengths) or any(
+            not 0 <= frame < length for frame, length in zip(frames, lengths)
         ):
             raise RecordingError(
-                "success_frames must be a list with one whole number for each episode"
+                "success_frames must have a frame of each episode, counted from the episode's start"
             )
 
     def check_workspace(self, meta: dict) -> None:
@@ -711,7 +713,8 @@ class WindowSampler:
         after_success: a window that begins more than so many frames after its episode's first
             success, if the recording says when that was, is a late one. None: no window is.
         late_fraction: the share of late windows among those that are drawn. They show how to stay
-            where the task is done, and are nearly the same. 0: there are none.
+            where the task is done; but they are nearly all alike, and a few are enough. 0: there
+            are none.
         augment: `batch` moves each scene by an affine map of its own, where the recording says
             which numbers of a state are positions. Rotations turn along where it says which they
             are (`rotation_near_rad`); other directions in the state or the action stay as they are.
@@ -756,7 +759,7 @@ class WindowSampler:
             self.rotation_near = torch.tensor(near, dtype=torch.float32, device=device)
         self.center = workspace_center(points, demonstrations.meta.get("workspace"))  # (1, 3)
         largest = float(self.action[:, :3].abs().max())
-        self.max_displacement = max(1.0, largest)  # moved actions are clipped to [-1, 1] or more
+        self.max_displacement = max(1.0, largest)  # moved actions are clipped to this
 
         success_frames = demonstrations.meta.get("success_frames")
         windows, late = [], []  # of each episode
@@ -804,7 +807,7 @@ class WindowSampler:
         T = max(math.ceil((episode.stop - episode.start) / stride) for episode in self.episodes)
         if T > self.config.demo_positions:
             raise RecordingError(
-                f"{self.task}: a demonstration has {T} frames (every {stride}th), the policy "
+                f"{self.task}: a demonstration has {T} frames (one in {stride}), the policy "
                 f"{self.config.demo_positions} positions: cut it, or train on such data"
             )
 
@@ -823,7 +826,7 @@ class WindowSampler:
     def sample(
         self, n: int, generator: torch.Generator, episodes: Sequence[int] | None = None
     ) -> dict[str, Tensor]:
-        """Draws n different windows (with repetition only where there are too few).
+        """Draws n different windows (with repetition only where there are too few of a kind).
 
         They are of the episodes of these indices; None: of all. If there are no late windows, early
         ones take their place.
@@ -873,7 +876,7 @@ class WindowSampler:
         """Draws a reference demonstration, and n windows of other episodes where there are any.
 
         The first `support` windows are of other episodes than the rest, where there are enough.
-        From the same ones, an inner step could lower the loss of the rest by having seen them.
+        Were they of the same ones, an inner step could lower the loss of the rest by memory.
         """
         reference = self.sample_episode(generator)
         demo = self.demonstration(reference)

@@ -43,7 +43,14 @@ import maml
 import model
 from clip import TextWeightsError, text_features
 from common import UserError, WorkerPool, progress_bar, report_progress, run_jobs
-from data import RecordingError, WindowSampler, load_demonstrations, positions, write_atomically
+from data import (
+    Demonstrations,
+    RecordingError,
+    WindowSampler,
+    load_demonstrations,
+    positions,
+    write_atomically,
+)
 from model import CheckpointError, DAMIPolicy
 from report import (
     Outcomes,
@@ -135,6 +142,7 @@ def take_inner_steps(
     batch: int,
     lr: maml.InnerRate,
     seed: int = 0,
+    demonstration_control: str | None = None,
 ) -> Iterator[tuple[int, float, DAMIPolicy]]:
     """Adapts a copy of a policy by steps of gradient descent, all on one batch (Eq. 2).
 
@@ -146,6 +154,8 @@ def take_inner_steps(
         batch: windows in the batch.
         lr: the learning rate, or parameter name -> tensor, see `maml.adapt`.
         seed: of the batch: its demonstration, its windows and their noise.
+        demonstration_control: what the policy reads in place of the batch's demonstration, a key of
+            DEMONSTRATION_CONTROLS; None: the demonstration.
 
     Yields:
         (steps done, loss of the batch after them, the adapted policy) after each step. The policy
@@ -161,6 +171,9 @@ def take_inner_steps(
         **sampler.batch(batch, generator),
         **adapted.draw_noise_and_timesteps(batch, generator),
     }
+    if demonstration_control is not None:
+        demonstration = {name: x for name, x in support.items() if name.startswith("demo_")}
+        support.update(DEMONSTRATION_CONTROLS[demonstration_control](demonstration))
     support = {name: x.to(text.device) for name, x in support.items()}
 
     loss_fn = partial(loss_of, policy)
@@ -432,9 +445,30 @@ class PolicyOfTask:
     recording: Path  # of the task's demonstrations
     n_demonstrations: int | None  # the first so many of them; None: all
     text: bytes  # the float32 numbers of the instruction feature
-    inner_steps: int  # these three are explained at `evaluate_checkpoint`
+    demonstration_control: str | None  # this and the next three: see `evaluate_checkpoint`
+    inner_steps: int
     inner_lr: float | None
     support: int | None
+
+
+def adaptation_sampler(
+    demonstrations: Demonstrations,
+    policy: DAMIPolicy,
+    info: dict[str, Any],
+    device: str | torch.device = "cpu",
+) -> WindowSampler:
+    """The windows that adapt a checkpoint's policy to a task.
+
+    Late ones are among them as often as in its training, but scenes are left as they are.
+    """
+    training = info["arguments"]
+    return WindowSampler(
+        demonstrations,
+        policy.config,
+        device=device,
+        after_success=training.get("after_success"),
+        late_fraction=training.get("late_fraction", 0.0),
+    )
 
 
 @lru_cache(maxsize=1)
@@ -447,7 +481,7 @@ def keep_policy_of_task(wanted: PolicyOfTask) -> tuple[DAMIPolicy, WindowSampler
     """
     policy, info = keep_policy(wanted.checkpoint, wanted.device, wanted.config_overrides)
     demonstrations = load_demonstrations(wanted.recording).take(wanted.n_demonstrations)
-    sampler = WindowSampler(demonstrations, policy.config, device=wanted.device)
+    sampler = adaptation_sampler(demonstrations, policy, info, wanted.device)
     text = torch.from_numpy(np.frombuffer(wanted.text, np.float32).copy()).to(wanted.device)
     if wanted.inner_steps > 0:
         of_each_step = take_inner_steps(
@@ -457,6 +491,7 @@ def keep_policy_of_task(wanted: PolicyOfTask) -> tuple[DAMIPolicy, WindowSampler
             steps=wanted.inner_steps,
             batch=wanted.support or info["arguments"]["support"],
             lr=rate_of_checkpoint(info, wanted.device, wanted.inner_lr),
+            demonstration_control=wanted.demonstration_control,
         )
         for _, _, adapted in of_each_step:
             policy = adapted  # in the end, that after the last step
@@ -492,12 +527,13 @@ def evaluate_checkpoint(
         recordings: task -> file with its demonstrations.
         text: task -> instruction feature, (text_dim,).
         episodes: rollouts of each task; episode i has the goal of `evaluation_seed(seed, i)`.
-        seed: chooses goals, noise and reference demonstrations.
+        seed: chooses goals, noise and reference demonstrations; with `known_goals` neither goals
+            nor noise.
         workers: processes; None: one a core.
         device: where the policy runs.
         n_demonstrations: use only the first so many of each recording; None: all.
-        demonstration_control: what the policy reads in place of its demonstration, a key of
-            DEMONSTRATION_CONTROLS; None: the demonstration.
+        demonstration_control: what the policy reads in place of its demonstration, in inner steps
+            as well, a key of DEMONSTRATION_CONTROLS; None: the demonstration.
         inner_steps: the policy is adapted to each task by so many steps before, see
             `take_inner_steps`.
         inner_lr: the learning rate of these steps; None: the one or those of its training.
@@ -517,12 +553,7 @@ def evaluate_checkpoint(
     jobs = []
     for task, recording in recordings.items():
         if known_goals:
-            demonstrated = load_demonstrations(recording).meta.get("episode_seeds")
-            if demonstrated is None:
-                raise UserError(
-                    f"--known-goals: {recording} does not say the seeds of its episodes"
-                )
-            seeds = demonstrated[:n_demonstrations][:episodes]
+            seeds = episode_seeds_of(recording)[:n_demonstrations][:episodes]
         else:
             seeds = [evaluation_seed(seed, episode) for episode in range(episodes)]
         wanted = PolicyOfTask(
@@ -532,6 +563,7 @@ def evaluate_checkpoint(
             recording=recording,
             n_demonstrations=n_demonstrations,
             text=text[task].cpu().float().numpy().tobytes(),
+            demonstration_control=demonstration_control,
             inner_steps=inner_steps,
             inner_lr=inner_lr,
             support=support,
@@ -543,7 +575,6 @@ def evaluate_checkpoint(
                     "simulator": simulator,
                     "task": task,
                     "seeds": seeds[start : start + episodes_a_job],
-                    "demonstration_control": demonstration_control,
                     "stop_at_success": stop_at_success,
                     "reference_seed": reference_seed,
                 }
@@ -573,12 +604,19 @@ def evaluate_checkpoint(
     return Outcomes(any_step, at_end, other_task or None)
 
 
+def episode_seeds_of(recording: Path) -> list[int]:
+    """The seeds of a recording's episodes. Raises UserError if it does not say them."""
+    seeds = load_demonstrations(recording).meta.get("episode_seeds")
+    if seeds is None:
+        raise UserError(f"--known-goals: {recording} does not say the seeds of its episodes")
+    return seeds
+
+
 def rollout_job(
     wanted: PolicyOfTask,
     simulator: Simulator,
     task: str,
     seeds: list[int],
-    demonstration_control: str | None,
     stop_at_success: bool,
     reference_seed: int | None,
 ) -> tuple[list[list[bool]], list[list[bool]]]:
@@ -601,7 +639,7 @@ def rollout_job(
         sampler=sampler,
         text=text,
         generator=torch.Generator().manual_seed(seeds[0]),
-        demonstration_control=demonstration_control,
+        demonstration_control=wanted.demonstration_control,
         reference=reference,
         stop_at_success=stop_at_success,
         on_steps=partial(report_progress, task),
@@ -951,7 +989,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         nargs="+",
         choices=inputs,
         default=[],
-        help="measure also with that of another task",
+        help="measure the last checkpoint also with that of another task",
     )
     add("--without", nargs="+", choices=inputs, default=[], help="zeros in the place of these")
     add(
@@ -959,10 +997,14 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         nargs="+",
         choices=tuple(DEMONSTRATION_CONTROLS),
         default=[],
-        help="measure also with only a part of the demonstration",
+        help="measure the last checkpoint also with only a part of the demonstration",
     )
     add("--seed", type=int, default=0, help="of goals, noise and demonstrations (default: 0)")
-    add("--known-goals", action="store_true", help="those of the demonstrations, not new ones")
+    add(
+        "--known-goals",
+        action="store_true",
+        help="those of the demonstrations, with noise that does not depend on --seed",
+    )
     add(
         "--stop-at-success",
         action="store_true",
@@ -1022,8 +1064,6 @@ def check_flags(args: argparse.Namespace) -> None:
             raise UserError(f"--swap {name} and --without {name}: leave out one of the two")
     if args.controls and "demonstration" in args.without:
         raise UserError("--controls change the demonstration: leave out --without demonstration")
-    if args.swap and args.top:
-        raise UserError("--swap measures the last checkpoint alone: leave out --top")
     if args.swap and args.known_goals:
         raise UserError("--known-goals are those of a task's own demonstrations: leave out --swap")
 
@@ -1250,6 +1290,9 @@ def measure(
         raise UserError(f"{out} holds an adapted policy: choose another --out")
     old_results = claim_results(out, args.overwrite)
     recordings, text, identity = load_inputs(args, simulator, tasks, info, device)
+    if args.known_goals:
+        for recording in recordings.values():
+            episode_seeds_of(recording)  # refuses one without, before old results are removed
 
     outcomes = {}
     with WorkerPool(args.workers) as pool:

@@ -263,12 +263,7 @@ def adapt_checkpoint(
     policy, info = evaluate.load_trained(checkpoint, text.device, **config_overrides)
     demonstrations = load_demonstrations(recording).take(settings.demonstrations)
     kept, heldout = hold_out(demonstrations, settings.held_out)
-    sampler = WindowSampler(
-        kept,
-        policy.config,
-        after_success=info["arguments"]["after_success"],
-        late_fraction=info["arguments"].get("late_fraction", 0.0),
-    )
+    sampler = evaluate.adaptation_sampler(kept, policy, info)
     write_text(folder / "metrics.jsonl", "")  # lines are appended
     if heldout is not None:
         heldout_sampler = WindowSampler(heldout, policy.config)
@@ -439,7 +434,7 @@ def check_recording(
 ) -> None:
     """Raises UserError for a recording of another task than --task says (`names`).
 
-    Of a simulator's recording it also checks that the simulator makes such ones today.
+    Of a simulator's recording it also checks that it was made by the simulator's present recipe.
     """
     if names is not None and list(names) != [recording.task]:
         raise UserError(f"{file} is a recording of {recording.task}, not of {' '.join(names)}")

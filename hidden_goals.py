@@ -12,8 +12,8 @@ windows of an inner step.
 Three things differ from ML1. Goals lie on a wide area, so that the way to one does not pass
 another. The hand begins at another place in every episode: from one place for all, a replay of the
 demonstration's actions would do. And the object begins in a region so small that Meta-World's rule,
-by which object and goal are 15 cm apart, never rejects a start: a rejected start would tell of the
-goal.
+by which object and goal are at least 15 cm apart, never rejects a start: a rejected start would
+tell of the goal.
 
 All lengths are metres, in the world frame.
 """
@@ -37,8 +37,9 @@ SKILLS = ("reach", "push", "pick-place")
 # them: reach-goal-07, reach-validation-07, reach-novel-07.
 GOALS = {"goal": 320, "validation": 10, "novel": 20}
 
-# Where goals lie: in this box, and so far from the middle of where objects begin, horizontally. The
-# least distance, less the farthest that an object begins from there, exceeds Meta-World's 0.15.
+# Where goals lie: in this box, and so far from the middle of where objects begin, horizontally.
+# Objects begin at most hypot(0.05, 0.03) = 0.058 from there: every goal is at least 0.21 - 0.058 =
+# 0.152 from the object, more than Meta-World's 0.15.
 GOAL_LOW, GOAL_HIGH = (-0.30, 0.50, 0.05), (0.30, 0.90, 0.30)
 GOAL_DISTANCE = (0.21, 0.32)
 ON_TABLE = 0.02  # the height of the goals of push
@@ -57,7 +58,7 @@ SMALL_RECIPE = {
     "camera": [*RECIPE["camera"][:2], CAMERA_PIXELS],
     "num_points": NUM_POINTS,
     "success": "at the end",
-    "rests_after": None,  # the expert needs no rest for that
+    "rests_after": None,  # the experts end in success without it
 }
 
 # What pictures are drawn from, which show the goal.
@@ -123,7 +124,7 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
         self.goal = goal_of(task)
 
         # Meta-World clips the goal that its expert reads to the goal space, which is narrower than
-        # ours. The space of observations, which follows from it, is not made yet.
+        # ours. It is widened here, before the space of observations is made from it and kept.
         low, high = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 1.5, 1.0])
         self.sawyer_env.goal_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
 

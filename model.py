@@ -14,7 +14,7 @@ The file reads from small blocks to `DAMIPolicy` and imports nothing of the proj
 section, PyTorch's layers written out for speed, can be skipped.
 
 Letters: B windows, G windows that share one demonstration, D demonstrations (B = D * G), T frames
-of a demonstration, N points (M critical ones), P = 3 numbers of a point, To = 2 observations (the
+of a demonstration, N points (R critical ones), P = 3 numbers of a point, To = 2 observations (the
 older first), H = 16 horizon, Ta = 8 executed actions, A action dim, S state dim, K = 100 diffusion
 steps, C condition width (timestep_dim + To * observation feature), L length of the action sequence
 inside the U-Net (H, then half of it a level). The first three numbers of a point are its position;
@@ -113,8 +113,8 @@ class PolicyConfig:
         most = H - To + 1
         if Ta > most:
             raise ValueError(
-                f"n_action_steps is {Ta}: of horizon {H} there are {most} actions after "
-                f"n_obs_steps {To}"
+                f"n_action_steps is {Ta}: of horizon {H} there are {most} actions from the newest "
+                f"of n_obs_steps {To} on"
             )
         levels = len(self.unet_widths)
         if H % 2 ** (levels - 1):
@@ -122,7 +122,7 @@ class PolicyConfig:
                 f"horizon {H} is no multiple of {2 ** (levels - 1)}: it is halved between the "
                 f"{levels} levels of unet_widths"
             )
-        if self.denoiser == "unet" and self.tcfm == "up" and levels == 1:
+        if self.denoiser in ("unet", "mamba-unet") and self.tcfm == "up" and levels == 1:
             raise ValueError(
                 f"tcfm is 'up', and unet_widths {self.unet_widths} have no up-sampling level"
             )
@@ -236,7 +236,8 @@ class PointNetEncoder(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """(..., N, P) float, normalized -> (..., feature_dim)."""
         if torch.is_grad_enabled():
-            rows, place = CriticalPoints.apply(points, *self.mlp.parameters())  # (R,), (clouds, C)
+            rows, place = CriticalPoints.apply(points, *self.mlp.parameters())
+            # rows (R,): points that matter; place (clouds, widths[-1]): which one has each maximum
             critical = points.flatten(0, -2)[rows]  # (R, P), those of all clouds
             largest = self.mlp(critical).gather(0, place)  # (clouds, widths[-1])
             largest = largest.view(*points.shape[:-2], -1)  # (..., widths[-1])
@@ -482,6 +483,7 @@ class ConditionalUNet1d(nn.Module):
             x = downsample(x)  # (B, width, L / 2), but for the last level
         for block in self.mid:
             x = block(x, conditions["mid"])
+        # There is one level less on the way up. As in DP3, the first level's skip stays unused.
         for level, (block1, block2, upsample) in enumerate(self.up):
             c = conditions["up"] if level == len(self.up) - 1 else h
             x = torch.cat([x, skips.pop()], dim=1)  # (B, 2 width, L)
@@ -567,8 +569,9 @@ class Normalizer(nn.Module):
     def fit(self, recordings: Iterable[Recording]) -> None:
         """Sets the ranges to those of all recordings together.
 
-        A coordinate that hardly moves (range under 1e-4) is centred and not stretched. One of an
-        action is stretched, so that a drawn value in [-1, 1] maps back to almost that constant.
+        A coordinate that hardly moves (range under 1e-4) is centred and not stretched. But one of
+        an action is divided by 5e-5: whatever is drawn in [-1, 1] then maps back to within 5e-5 of
+        the constant.
         """
         recordings = list(recordings)
         for name in ("points", "state", "action"):
@@ -638,7 +641,8 @@ class DAMIPolicy(nn.Module):
         if self.conditioned_by_h:
             self.condition_encoder = ConditionEncoder(config)
         self.denoiser = denoisers[config.denoiser](config)
-        if config.tcfm == "none" and config.reads_task:  # an ablation
+        # An ablation. It comes last, so that a seed draws the rest as without it.
+        if config.tcfm == "none" and config.reads_task:
             self.u2t = PooledTask(config)
         self.schedule = DiffusionSchedule(
             config.diffusion_steps, config.inference_steps, config.sampler
@@ -731,6 +735,8 @@ class DAMIPolicy(nn.Module):
         h = self.condition_encoder(timesteps, observation)  # (B, C)   Eq. 7
         if context is None:
             return self.denoiser(noisy, h)
+        if len(h) % len(context[0]) != 0:
+            raise ValueError(f"{len(h)} windows cannot be of {len(context[0])} tasks alike")
         fused = self.u2t(h, context)  # (B, C)
         if self.config.tcfm == "none":
             return self.denoiser(noisy, fused)
@@ -758,7 +764,7 @@ class DAMIPolicy(nn.Module):
             task: the arguments of `encode_demo`, of D tasks; D divides B.
 
         Raises:
-            ValueError: an input is missing or has a wrong shape.
+            ValueError: an input is missing or has a wrong shape, or D does not divide B.
         """
         self.check_shapes(
             points=points, state=state, action=action, noise=noise, timesteps=timesteps
@@ -789,7 +795,7 @@ class DAMIPolicy(nn.Module):
             (B, Ta, A), to be executed from the newest observation on, in the demonstrations' unit.
 
         Raises:
-            ValueError: the context is missing, or an input has a wrong shape.
+            ValueError: the context is missing, an input has a wrong shape, or D does not divide B.
         """
         self.check_shapes(points=points, state=state)
         if context is None and self.reads_task:
@@ -984,9 +990,9 @@ def load(
         (policy, info): info is what `save` was given.
 
     Raises:
-        CheckpointError: the file is missing, damaged, not one of `save` or of an older version of
-            it, lacks one of `needs`, its weights and its configuration do not fit, or it cannot be
-            used with `config_overrides`.
+        CheckpointError: the file is missing or damaged, was not written by `save`, or by an older
+            version of it, or lacks one of `needs`; its weights and its configuration do not fit; or
+            it cannot be used with `config_overrides`.
     """
     path = Path(path)
     content = read_archive(path, device)
@@ -998,6 +1004,11 @@ def load(
         raise CheckpointError(
             f"{path} is of another version of the code, with settings that are unknown here: "
             f"{', '.join(unknown)}"
+        )
+    if config.get("policy", "dami") not in POLICIES:
+        raise CheckpointError(
+            f"{path}: policy {config['policy']!r} is unknown: import the file that adds it first, "
+            "such as baselines.py"
         )
     try:
         config = PolicyConfig(**config)
@@ -1130,8 +1141,9 @@ class CriticalPoints(torch.autograd.Function):
     def forward(points: Tensor, *layers: Tensor) -> tuple[Tensor, Tensor]:
         """points (..., N, P); weight, bias, norm's weight and bias of each layer.
 
-        Returns the critical points of all clouds, (R,) int64 in [0, clouds * N), each once; and for
-        each cloud and channel the place of its maximum among them, (clouds, channels) int64.
+        Returns the critical points of all clouds, (R,) int64 in [0, clouds * N), each once, behind
+        which others may follow (see `rows`); and for each cloud and channel the place of its
+        maximum among them, (clouds, channels) int64.
         """
         argmax = CriticalPoints.argmax(points, layers)  # (clouds, channels)
         clouds, N = points.shape[:-2].numel(), points.shape[-2]

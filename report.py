@@ -241,6 +241,8 @@ def write_report(
         report["checkpoints"] = {label: outcome.any_step for label, outcome in checkpoints.items()}
     note = ", ".join(f"{name} {value}" for name, value in provenance.items())
     measured = "at any step, or at the end" if kinds["at the end"] else "at any step"
+    if kinds["the other task"]:
+        measured += ", or, at any step, at the other task of the pair"
 
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "success.json", json.dumps(report, indent=1))

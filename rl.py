@@ -117,13 +117,12 @@ class GaussianPolicy(nn.Module):
         return self.mean(states), self.log_std
 
     def loss(self, params: Params, batch: Batch) -> Tensor:
-        """The loss (), whose negative gradient is the policy gradient at these parameters.
+        """The loss (), -E[log p(a | s) A], whose negative gradient is the policy gradient.
 
-        The inner step descends this loss. The outer gradient is taken of it, too, though TRPO's
-        outer loss weighs each advantage by the ratio of the action's probabilities under the new
-        and the old policy. That gradient is only taken where the new policy is the old one, and
-        there the two losses have the same first derivatives. Second ones of the outer loss are not
-        needed.
+        The inner step descends it, and the outer gradient is taken of it, too. TRPO's outer loss is
+        -E[r A], where r is the ratio of the action's probabilities under the new and the old
+        policy. Its gradient is needed only at the old policy, and there, where r = 1, it is that
+        of this loss. The line search uses TRPO's loss itself (`surrogate_loss_and_kl`).
         """
         mean, log_std = functional_call(self, params, batch["states"])
         return -(log_probability(mean, log_std, batch["actions"]) * batch["advantages"]).mean()
@@ -430,7 +429,8 @@ def trpo_step(
             candidate = {name: p - change[name] for name, p in params.items()}
             loss, kl = adapted.surrogate_loss_and_kl(candidate, old)
             if loss < old_loss and kl <= settings.max_kl:
-                policy.load_state_dict(candidate)  # no worker reads it any more: jobs have ended
+                # Workers share the memory of the weights, but their jobs have ended.
+                policy.load_state_dict(candidate)
                 return kl, n
     return 0.0, settings.backtracks
 
@@ -524,13 +524,18 @@ def restore(path: Path, settings: Settings, suite: str) -> Run:
         raise UserError(f"{path} is of no run of rl.py: look at --out")
     policy = GaussianPolicy(*saved["shape"])
     policy.load_state_dict(saved["weights"])
+    then = {"suite": saved["suite"], **saved["settings"]}
+    now = {"suite": suite, **asdict(settings)}
     changed = [
-        name
-        for name, value in asdict(settings).items()
-        if name not in FREE_TO_CHANGE and saved["settings"].get(name) != value
+        f"{name} {then.get(name)} -> {value}"
+        for name, value in now.items()
+        if name not in FREE_TO_CHANGE and then.get(name) != value
     ]
-    if saved["suite"] != suite or changed:
-        raise UserError(f"{path} was trained with other settings: use those, or another --out")
+    if changed:
+        raise UserError(
+            f"{path} was trained with other settings ({', '.join(changed)}): use those, or another "
+            "--out"
+        )
     return Run(policy, saved["iteration"], saved["seconds"])
 
 

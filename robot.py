@@ -56,11 +56,21 @@ from common import UserError, setting
 from data import Demonstrations, RecordingError
 from model import CheckpointError
 
+try:
+    from termios import error as TerminalError  # raised by pyserial if an adapter is pulled out
+
+    TERMINAL_ERRORS: tuple = (TerminalError,)
+except ImportError:  # Windows has no terminals of this kind
+    TERMINAL_ERRORS = ()
+
 STATE_DIM = ACTION_DIM = 7
 
 
 class RobotError(Exception):
-    """Arm, gripper or camera cannot go on; the message says why. The arm has been stopped."""
+    """Arm, gripper or camera cannot go on; the message says why.
+
+    Where nobody catches it, it ends the command, and the arm is stopped.
+    """
 
 
 class CameraError(RobotError):
@@ -95,10 +105,12 @@ class Settings:
     `check_steps` and `check_poses` tell whether the arm may do what it is to do.
     """
 
-    tcp_low_m: tuple = setting(MISSING, "the box that the TCP stays in", **CORNER)
-    tcp_high_m: tuple = setting(MISSING, "its upper corner", **CORNER)
-    crop_low_m: tuple = setting(MISSING, "the box that points are kept in", **CORNER)
-    crop_high_m: tuple = setting(MISSING, "its upper corner", **CORNER)
+    tcp_low_m: tuple = setting(MISSING, "lower corner of the box that the TCP stays in", **CORNER)
+    tcp_high_m: tuple = setting(MISSING, "upper corner of that box", **CORNER)
+    crop_low_m: tuple = setting(
+        MISSING, "lower corner of the box of points that are kept", **CORNER
+    )
+    crop_high_m: tuple = setting(MISSING, "upper corner of that box", **CORNER)
     camera_to_base: tuple = setting(MISSING, "pose of the DEPTH frame", **TRANSFORM)
     start_pose: tuple | None = setting(None, "where `run` begins", shape=(6,), least=-6.3, most=6.3)
     outside_box: str = setting("stop", "for targets outside the box", choices=("stop", "clamp"))
@@ -256,7 +268,8 @@ OUTPUTS = (
     "output_int_register_25",  # the number of the package that our program followed last
 )
 # Registers 0 to 23 belong to the fieldbus. Every package holds its number, the pose to go to, the
-# session's number, or STOP, and its own number again.
+# session's number (or STOP), and its number once more: where the two differ, the program has met a
+# package that is only half written.
 POSE = tuple(f"input_double_register_{24 + i}" for i in range(6))
 INPUTS = ("input_int_register_25", *POSE, "input_int_register_24", "input_int_register_26")
 STOP = 0  # in the place of the session's number: the program ends
@@ -664,7 +677,7 @@ class Gripper:
                 answer = self.port.read(5)  # the whole of an exception frame
                 if len(answer) == 5 and not answer[1] & 0x80:
                     answer += self.port.read(2 if function == READ else 3)
-            except OSError as error:
+            except (OSError, *TERMINAL_ERRORS) as error:
                 problem = str(error)
                 continue
             if len(answer) < 5:
@@ -684,6 +697,7 @@ class Gripper:
     def initialize(self, timeout: float = 10.0) -> None:
         """Initializes a gripper that is not, which opens and closes it; then sets the force."""
         if self.exchange(READ, INITIALIZED, 1) != 1:
+            print("the gripper is initialized: it opens and closes", flush=True)
             self.exchange(WRITE, INITIALIZE, 1)
             deadline = time.monotonic() + timeout
             while self.exchange(READ, INITIALIZED, 1) != 1:
@@ -726,22 +740,21 @@ def depth_to_points(depth: np.ndarray, intrinsics: Sequence[float]) -> np.ndarra
     return np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=-1).astype(np.float32)
 
 
-def to_base(
-    depth: np.ndarray, intrinsics: Sequence[float], settings: Settings
-) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W), metres -> points float32, base frame: all (M, 3), those in the crop box (K, 3).
-
-    Raises CameraError if there are none.
-    """
+def to_base(depth: np.ndarray, intrinsics: Sequence[float], settings: Settings) -> np.ndarray:
+    """Depth (H, W), metres -> points (M, 3) float32, base frame. Raises CameraError for none."""
     points = depth_to_points(depth, intrinsics)
     if len(points) == 0:
         raise CameraError("the camera's depth is empty: check its cable, power and what it sees")
     pose = np.array(settings.camera_to_base)
-    points = (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)  # (M, 3) base frame
+    return (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
+
+
+def crop(points: np.ndarray, settings: Settings) -> np.ndarray:
+    """Points (M, 3), base frame -> those in the crop box (K, 3). Raises CameraError for none."""
     kept = ((points >= settings.crop_low_m) & (points <= settings.crop_high_m)).all(axis=1)
     if not kept.any():
         raise CameraError("no point lies in the crop box: check camera_to_base and crop_low_m")
-    return points, points[kept]
+    return points[kept]
 
 
 SAMPLED_FROM = 8192  # points at most: 10 ms
@@ -761,7 +774,7 @@ def cloud(
     SAMPLED_FROM are thinned before: sampling holds Python's lock, so that no other thread runs, and
     300 000 points would delay the servo stream by a quarter of a second.
     """
-    _, points = to_base(depth, intrinsics, settings)
+    points = crop(to_base(depth, intrinsics, settings), settings)
     return data.farthest_point_sample(thin(points), settings.num_points), len(points)
 
 
@@ -952,9 +965,9 @@ class Servo:
     holds the last target when all are reached. With `free` it only keeps the arm free to be moved
     by hand. It stops for good, and says why, when
 
-    - the newest state is older than `max_state_age_s`, or arrives later by that than the promptest
-      one did; the connection or its framing is lost; the controller's clock stands still or runs
-      backwards;
+    - the newest state is older than `max_state_age_s`, or states take longer to arrive, by as much,
+      than the quickest one did; the connection or its framing is lost; the controller's clock
+      stands still or runs backwards;
     - the robot is not running, its safety mode is neither normal nor reduced, its speed slider is
       not at 100 %, or our program is paused, has ended, or has been replaced by another;
     - the arm is farther than `max_lag_m` or `max_lag_rad` from where it should be;
@@ -964,9 +977,10 @@ class Servo:
     To stop is to tell the program on the controller to end, once; nothing is sent after that.
 
     An arm that follows `servoj` is behind by about its lookahead time. So no pose is sent that is
-    farther ahead of the measured one than the arm may go in that time: then an arm that was held
-    back, and is let go, is not faster than allowed. As the measured pose is old by `DELAY`, targets
-    move slower than the arm may: at 80 % of its speed where the lookahead time is 0.1 s.
+    farther ahead of the measured one than the arm may go in that time: an arm that was held back
+    by force, and is let go, is then not faster than allowed. The measured pose is `DELAY` old, so
+    that targets move at lookahead / (lookahead + DELAY) of the arm's greatest speed: at 80 % of it
+    where the lookahead time is 0.1 s.
     """
 
     DELAY = 0.025  # seconds from measuring a pose to following the answer
@@ -1004,7 +1018,9 @@ class Servo:
         self.error: str | None = None  # why the arm was stopped
         self.ended = threading.Event()
         self.counters: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
-        self.least_delay = math.inf  # of the promptest state; like all delays, plus a constant
+        self.least_delay = (
+            math.inf
+        )  # of all states; delays have a constant added, which does not matter
         self.last_step = (time.monotonic(), time.process_time())  # of the stream
         self.stall = ""  # why the stream stood still for so long that the watchdog may have struck
         self.stalled_at = -math.inf  # when that was noticed
@@ -1039,7 +1055,7 @@ class Servo:
         self.last_step = (self.held_since, time.process_time())
         self.thread.start()
 
-    def check_start(self, state: State, deadline: float, uploaded: bool) -> None:
+    def check_start(self, state: State, deadline: float = math.inf, uploaded: bool = False) -> None:
         """Raises RobotError if the program must not be started in this state, or does not start."""
         state.check()
         if not self.free:
@@ -1291,7 +1307,7 @@ class Servo:
         late = 1000 * np.array(self.lateness or [0.0])  # milliseconds
         oldest = 1000 * max(self.ages, default=0.0)
         return (
-            f"{len(self.lateness)} packets at {self.settings.servo_hz:g} Hz: late by "
+            f"{len(self.lateness)} packages at {self.settings.servo_hz:g} Hz: late by "
             f"{np.percentile(late, 50):.2f} ms (median), {np.percentile(late, 99):.2f} ms (99 %), "
             f"{late.max():.2f} ms (worst); oldest state {oldest:.1f} ms"
         )
@@ -1322,9 +1338,9 @@ class Cell:
     def observe(self, servo: Servo | None = None) -> Frame:
         """The present observation.
 
-        If the camera gives none, `servo` holds the arm, and stops it after `max_hold_s`. A
-        RealSense is waited for up to a second before, in which the arm goes on with its chunk.
-        Without a servo that is a CameraError at once.
+        If the camera gives none, `servo` holds the arm, and stops it after `max_hold_s`; without a
+        servo CameraError is raised. Before that, reading a RealSense may take up to a second, in
+        which the arm goes on with its chunk.
         """
         while True:
             try:
@@ -1349,17 +1365,18 @@ class Cell:
         state = np.append(pose, closed).astype(np.float32)
         return Frame(time=time.monotonic(), points=points, seen=seen, state=state)
 
-    def prepare(self, moves: bool) -> None:
+    def prepare(self, servo: Servo) -> None:
         """Raises RobotError if camera, gripper or arm are not ready; then initializes the gripper.
 
-        Nothing moves before all three have answered; without `moves` nothing moves at all.
+        Nothing moves before all three have answered, and the arm could start. Where the servo does
+        not move the arm, the gripper does not move either.
         """
         self.observe()
         try:
-            self.rtde.state(self.settings.max_state_age_s).check()
+            servo.check_start(self.rtde.state(self.settings.max_state_age_s))
         except RobotError as error:
             raise RobotError(f"the arm is not moved: {error}") from None
-        if moves:
+        if servo.moves:
             self.gripper.initialize()
 
     def made_with(self, recording: Demonstrations | None = None) -> dict:
@@ -1579,9 +1596,9 @@ def drive(
 ) -> None:
     """Executes the chunks (Ta, 7) that `act` makes of all frames seen, until it returns None.
 
-    If camera or gripper are late, or fail, the rest of a chunk is left out. However this ends,
-    frames and actions are written to a file in the format of recordings; only a second Ctrl-C may
-    prevent that.
+    If the camera is late or fails, or the gripper is late, the rest of a chunk is left out; a
+    gripper that fails ends the run. However this ends, frames and actions are written to a file in
+    the format of recordings; only a second Ctrl-C may prevent that.
     """
     name = f"{recording.task}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.npz"
     out = Path(args.out or f"runs/robot/{name}")
@@ -1592,7 +1609,7 @@ def drive(
         meta = {**cell.made_with(recording), "made_by": f"robot.{args.command}"}
         servo = Servo(cell.rtde, settings, moves=not args.dry_run, activity=cell.activity)
         try:
-            cell.prepare(servo.moves)
+            cell.prepare(servo)
             servo.start(args.host)
             if start is not None:
                 servo.go(np.array(start))
@@ -1681,7 +1698,7 @@ class Keys:
 
 
 def episode_actions(frames: list[Frame], grip: list[float], settings: Settings) -> np.ndarray:
-    """Frames (T) and the gripper's commands (T) -> actions (T, 7); each leads to the next frame.
+    """Frames (T) and the gripper's commands after each (T) -> actions (T, 7), to the next frame.
 
     Raises RobotError for an episode that `run` could not execute.
     """
@@ -1692,8 +1709,8 @@ def episode_actions(frames: list[Frame], grip: list[float], settings: Settings) 
     # An action takes 1 / policy_hz seconds: `replay` would be faster than the hand was.
     if gaps.max() > 2 / settings.policy_hz or gaps.mean() > 1.2 / settings.policy_hz:
         raise RobotError(
-            f"frames are {gaps.mean():.2f}, up to {gaps.max():.2f} s apart, camera or gripper were "
-            "late"
+            f"frames are {gaps.mean():.2f}, up to {gaps.max():.2f} s apart, where an action takes "
+            f"{1 / settings.policy_hz:.2f} s: camera or gripper were late"
         )
     moves = [difference(a, b) for a, b in itertools.pairwise(poses)]
     return np.column_stack([[*moves, np.zeros(6)], grip])
@@ -1711,12 +1728,14 @@ class Recorder:
     count: int = 0  # episodes kept since the start
     closed: float = 0.0  # the gripper's command: 0 open, 1 closed
     frames: list[Frame] | None = None  # of the episode that is being recorded; None: there is none
-    grip: list[float] = field(default_factory=list)  # the gripper's command at each frame
+    grip: list[float] = field(default_factory=list)  # the gripper's command after each frame
 
     def press(self, key: str, servo: Servo) -> None:
         """Does what a key asks for."""
         if key == "g":
             self.closed = 1.0 - self.closed
+            if self.frames:  # the frame before shows nothing of it: an action follows what is seen
+                self.grip[-1] = self.closed
             servo.check()
             if servo.moves:
                 with self.cell.activity.during("moving the gripper"):
@@ -1782,10 +1801,10 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
     moves = not args.dry_run
     with common.locked(out.parent), connect(args, settings, write=moves) as cell, Keys() as keys:
         meta = {**cell.made_with(kept), "made_by": "robot.record", "camera": args.camera}
-        cell.prepare(moves)
+        servo = Servo(cell.rtde, settings, moves=moves, free=True, activity=cell.activity)
+        cell.prepare(servo)
         recorder = Recorder(args=args, cell=cell, out=out, meta=meta, kept=kept)
         recorder.closed = float(cell.gripper.read() > 0.5)
-        servo = Servo(cell.rtde, settings, moves=moves, free=True, activity=cell.activity)
         try:
             servo.start(args.host)
             print("keys: s starts an episode, e ends and keeps it, d drops it, ", end="")
@@ -1795,9 +1814,9 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
                 key = keys.pressed()
                 if key == "q":
                     break
+                recorder.observe()
                 recorder.press(key, servo)
                 servo.check()
-                recorder.observe()
                 due = max(due + 1 / settings.policy_hz, time.monotonic())
                 time.sleep(max(0.0, due - time.monotonic()))
             if recorder.frames is not None:
@@ -1837,9 +1856,16 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
                 raise RobotError("it is not in remote control: switch that at the panel")
         except RobotError as error:
             trouble = str(error)
-        depth = cell.camera.read()
-        points, kept = to_base(depth, cell.camera.intrinsics, settings)
-        low, high = kept.min(0).round(3), kept.max(0).round(3)
+        depth, points, kept = np.zeros((0, 0)), np.zeros((0, 3)), np.zeros((0, 3))
+        try:
+            depth = cell.camera.read()
+            points = to_base(depth, cell.camera.intrinsics, settings)
+            kept = crop(points, settings)
+            low, high = kept.min(0).round(3), kept.max(0).round(3)
+            box = f"{len(kept)} of {len(points)} in the crop box, {low} to {high} m"
+        except CameraError as error:
+            box = f"none: {error}"
+            trouble = trouble or str(error)
         version = ".".join(map(str, cell.rtde.version))
         gripper_state = cell.gripper.exchange(READ, INITIALIZED, 1)
         meta = cell.made_with()
@@ -1851,19 +1877,20 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
             "state": trouble or "ready",
             "recorded with": meta,
             "gripper": f"{cell.gripper.read():.2f} (0 open, 1 closed), state {gripper_state}",
-            "depth": f"in {(depth > 0).mean():.0%} of {depth.shape[1]} x {depth.shape[0]} pixels",
-            "points": f"{len(kept)} of {len(points)} in the crop box, {low} to {high} m",
+            "depth": f"in {np.count_nonzero(depth) / max(1, depth.size):.0%} of {depth.shape[1]} x "
+            f"{depth.shape[0]} pixels",
+            "points": box,
         }
     for name, value in rows.items():
         print(f"{name:22}{value}")
-    if args.picture:
+    if args.picture and len(points) > 0:
         frame = Frame(
             time=0.0, points=thin(points), seen=len(kept), state=np.append(state.pose, 0.0)
         )
         plot_cell(args.picture, frame, meta)
         print(f"wrote {args.picture}")
     if trouble:
-        raise RobotError(f"the arm cannot be moved: {trouble}")
+        raise RobotError(f"not ready: {trouble}")
 
 
 def plot_cell(path: str, frame: Frame, meta: dict) -> None:

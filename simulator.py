@@ -228,8 +228,8 @@ def seeds_of_a_task(simulator: Simulator) -> int:
 def demonstration_seed(simulator: Simulator, task: str, seed: int, attempt: int) -> int:
     """Returns the episode seed of one attempt at a demonstration, below 10**8.
 
-    No two tasks share a seed: some tasks draw their goals alike, so that their demonstrations would
-    have the same goals. Raises ValueError for an attempt that would have a seed of the next task.
+    No two tasks share a seed. With equal seeds, tasks that draw their goals alike would have the
+    same ones. Raises ValueError for an attempt that would have a seed of the next task.
     """
     seeds = seeds_of_a_task(simulator)
     if not 0 <= attempt < seeds:
@@ -261,7 +261,11 @@ def check_recipe(demonstrations: Demonstrations, path: str | Path, recipe: dict[
             f"{path} was recorded by an older version, or is a recording of your own: "
             "move it or use another --data"
         )
-    changed = [name for name, value in recipe.items() if demonstrations.meta.get(name) != value]
+    changed = [
+        name
+        for name, value in recipe.items()
+        if demonstrations.meta.get(name) != value and name != "made_by"  # advice, and no property
+    ]
     if changed:
         raise UserError(
             f"{path} was recorded with another {', '.join(changed)}: move it or use another --data"
@@ -385,7 +389,7 @@ def collect_task(simulator: Simulator, task: str, path: Path, episodes: int, see
         if attempts == most_attempts:
             raise UserError(
                 f"{task}: the expert succeeded in {len(recorded)} of {attempts} episodes; "
-                "`python simulator.py --seed` tries others"
+                "ask for fewer demonstrations of it, or leave the task out"
             )
         drawn_seed = demonstration_seed(simulator, task, seed, attempts)
         attempts += 1

@@ -99,12 +99,14 @@ class Settings:
     vectorize: int = setting(1, "tasks that run at once; memory grows with them", least=1)
     bfloat16: bool = setting(False, "compute steps without an inner step in bfloat16")
     after_success: int | None = setting(
-        None, "windows that begin so many frames after their episode's success are late", least=0
+        None, "windows that begin more than so many frames after success are late", least=0
     )
-    late_fraction: float = setting(0.0, "fraction of late windows", least=0, most=1)
+    late_fraction: float = setting(
+        0.0, "fraction of late windows among those that are drawn; 0: none is", least=0, most=1
+    )
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
     one_map: bool = setting(
-        False, "augment all scenes of a task by one map, where a place tells the task"
+        False, "augment all scenes of a batch alike, its demonstration included"
     )
     instruction_dropout: float = setting(
         0.0, "fraction of the batches without instruction", least=0, most=1
@@ -159,6 +161,9 @@ SETTINGS = {
 # fmt: on
 
 
+# In the suites below episodes are short, and end soon after their success: no window is late.
+ALL_WINDOWS = {"after_success": None, "late_fraction": 0.0}
+
 # What a suite of hidden goals changes, in every preset. The instruction tells nothing, and need
 # not be left out for the demonstration to be read. One map moves all scenes of a task, which makes
 # new goals; a map of each scene's own would hide the goal. What was learned is measured on novel
@@ -171,8 +176,7 @@ HIDDEN_GOALS = {
     "one_map": True,
     "instruction_dropout": 0.0,
     "task_dropout": 0.0,
-    "after_success": None,
-    "late_fraction": 0.0,
+    **ALL_WINDOWS,
     "evaluate_on": "novel",
     "episodes": 2,
 }
@@ -191,15 +195,14 @@ HIDDEN_GOALS_SMALL = {
 HIDDEN_GOALS_STEPS = {"reach": 1_500, "push": 3_000, "pick-place": 3_000}  # of `small`
 
 # What pairs change. The instruction does not tell the task, so leaving it out teaches nothing.
-PAIRS = {"instruction_dropout": 0.0, "after_success": None, "late_fraction": 0.0}
+PAIRS = {"instruction_dropout": 0.0, **ALL_WINDOWS}
 
 # What turned actions change. Augmentation also stretches scenes, and so would change the angle.
 CONVENTION = {
     "demonstrations": 8,
     "augment": False,
     "instruction_dropout": 0.0,
-    "after_success": None,
-    "late_fraction": 0.0,
+    **ALL_WINDOWS,
     "evaluate_on": "novel",
     "episodes": 5,
 }
@@ -681,25 +684,24 @@ class Evaluation:
 
         Title -> outcomes of the last checkpoint: with each task's own demonstration (`own`, which
         is measured already), with that of another task, and without any; then the same after an
-        inner step, if there was any in training. Also animates the first two tasks, from one seed.
+        inner step, if there was any in training. That step is taken on windows of the task whose
+        demonstration is shown. Also animates the first two tasks, from one seed.
         """
         settings = self.settings
         checkpoint = self.folder / f"ema-{settings.steps:05d}.pt"
-        inputs: dict[str, dict[str, Any]] = {"no demonstration": {}}
+        own_title = "own demonstration" if reads_demonstration else "no demonstration"
+        others: dict[str, dict[str, Any]] = {}
         if reads_demonstration:
-            inputs = {
-                "own demonstration": {},
-                "another task's": {"recordings": evaluate.of_next_task(self.recordings)},
-                "none": {"demonstration_control": "zeros"},
-            }
-        columns = {}
+            others["another task's"] = {"recordings": evaluate.of_next_task(self.recordings)}
+            others["none"] = {"demonstration_control": "zeros"}
+        columns = {own_title: own}
         try:
             with stop.suspended(), WorkerPool(self.workers) as pool:
                 roll_out = partial(self.roll_out, checkpoint, pool=pool)
-                for title, options in inputs.items():
-                    columns[title] = roll_out(**options) if options else own
+                for title, options in others.items():
+                    columns[title] = roll_out(**options)
                 if settings.pretrain_steps < settings.steps:
-                    for title, options in inputs.items():
+                    for title, options in {own_title: {}, **others}.items():
                         after = roll_out(**options, inner_steps=1)
                         columns[f"{title}, after an inner step"] = after
             with stop.suspended():

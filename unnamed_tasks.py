@@ -145,7 +145,7 @@ class PairEnv(MetaWorldPointCloudEnv):
         scene, data = SCENES[self.scene], self.sawyer_env.data
         data.joint(scene.joint).qpos[:] = scene.joint_start
         mujoco.mj_forward(self.sawyer_env.model, data)
-        self.sawyer_env._get_obs()  # an observation holds the one before, which is to be of now
+        self.sawyer_env._get_obs()  # an observation repeats the one before: both are of this state
         return self.sawyer_env._get_obs()
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:

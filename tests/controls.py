@@ -1,11 +1,11 @@
 """What needs no network where goals are hidden, and so says what a success of a policy is worth.
 
-    python -m tests.controls --suite goals-reach --out runs/controls-reach
+    python -m tests.controls --suite goals-reach --out runs/goals-reach-controls
 
 `replay` takes the demonstration's actions one by one. `servo` moves the hand to where it was at the
 demonstration's end, with the fingers as they were there. `expert` is Meta-World's script, which is
-told the goal. Episodes and demonstrations are as many as in `evaluate.py --split novel`; the
-demonstration of each episode is drawn anew.
+told the goal. Demonstrations are as many as in `evaluate.py --split novel`, and starts are the
+same; the demonstration of each episode is drawn anew.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from common import command_line, locked, provenance, report_progress, run_jobs
-from data import load_demonstrations
+from data import RecordingError, load_demonstrations
 from evaluate import claim_results
 from report import Outcomes, write_report
 from simulator import Simulator, collect, environments_of, evaluation_seed, simulator_of
@@ -64,14 +64,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=5, help="episodes a task (5)")
     parser.add_argument("--seed", type=int, default=SEED, help=f"of the starts ({SEED})")
     parser.add_argument("--workers", type=int, help="processes (one a core)")
-    parser.add_argument("--out", default="runs/controls", help="folder of the report")
+    parser.add_argument("--out", help="folder of the report (runs/SUITE-controls)")
+    parser.add_argument("--overwrite", action="store_true", help="replace the report in it")
     args = parser.parse_args(argv)
 
     simulator = simulator_of(args.suite)
     _, tasks = simulator.tasks(args.suite)
-    out = Path(args.out)
+    out = Path(args.out or f"runs/{args.suite}-controls")
     with locked(out):
-        claim_results(out, overwrite=False)
+        claim_results(out, args.overwrite)  # the new report takes the place of the old one
         recordings = collect(
             simulator, tasks, args.data, episodes=simulator.demonstrations, workers=args.workers
         )
@@ -111,4 +112,4 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main)
+    command_line(main, errors=(RecordingError,))

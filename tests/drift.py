@@ -5,8 +5,8 @@
 
 The policy is shown frames of the demonstrations that it was trained on, and draws an action for
 each. A row says, for a part of these episodes, how far the expert moves away from the robot (the y
-of an action, in centimetres a step), and how far the policy would. Where the two differ, neither
-new goals nor errors that add up are the reason.
+of an action, which is positive in that direction, in centimetres a step), and how far the policy
+would. Where the two differ, neither new goals nor errors that add up are the reason.
 """
 
 import argparse

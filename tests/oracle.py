@@ -6,8 +6,8 @@
     python -m tests.oracle pixels train.py --suite ml10 --data data-pixels --out runs/pixels
 
 `positions`: the state also holds where the object and the goal truly are. `pixels`: the camera
-casts four times as many rays. Both are simulators of their own, and their recordings and
-checkpoints are of no other one.
+casts four times as many rays. Both are simulators of their own, whose recordings fit no other one.
+A checkpoint does not say in which world it was trained: measure it in the same.
 `augmented-twice`: scenes are turned and stretched up to twice as much in training.
 `not-averaged`: what is kept are the weights themselves, in place of their moving average.
 """
@@ -63,6 +63,10 @@ class MetaWorldWithPositions(MetaWorld):
         return EnvWithPositions(task, num_points, episode_steps=self.episode_steps)
 
 
+class EnvWithPixels(MetaWorldPointCloudEnv):
+    camera_pixels = 2 * CAMERA_PIXELS
+
+
 @dataclass(frozen=True)
 class MetaWorldWithPixels(MetaWorld):
     """The camera has twice as many rows and columns."""
@@ -72,10 +76,8 @@ class MetaWorldWithPixels(MetaWorld):
         "camera": [CAMERA, list(CAMERA_POSITION), 2 * CAMERA_PIXELS],
     }
 
-    def make(self, task: str, num_points: int) -> MetaWorldPointCloudEnv:
-        env = super().make(task, num_points)
-        env.camera = env.make_camera(2 * CAMERA_PIXELS)
-        return env
+    def make(self, task: str, num_points: int) -> EnvWithPixels:
+        return EnvWithPixels(task, num_points, episode_steps=self.episode_steps)
 
 
 # ---- Worlds --------------------------------------------------------------------------------------
@@ -97,7 +99,7 @@ def augmented_twice() -> None:
 
 
 def not_averaged() -> None:
-    """Makes a training's moving average one of the last weights alone."""
+    """Keeps the last weights in place of their moving average."""
     train.ema_model = lambda policy: AveragedModel(policy, avg_fn=lambda mean, last, n: last)
 
 

@@ -35,7 +35,7 @@ METHOD = {  # a variant of the method -> its flags of train.py
     "no-inner-loop": "--maml off",
     "no-demonstration": "--demo-encoder none",
     "neither": NEITHER,
-    "twice-as-long": f"{NEITHER} --steps 20000",
+    "twice-as-long": f"{NEITHER} --steps 20000",  # twice the 10,000 of the older recipe
     "first-order": "--maml first",
     "first-order-3e-2": "--maml first --inner-lr 3e-2",
     "inner-3e-2": "--inner-lr 3e-2",
@@ -67,7 +67,7 @@ LIMITS = {  # what more or less of something would buy; measured on base tasks a
     "pixels": f"{NEITHER} --data data-pixels",
 }
 SHORT = f"{NEITHER} --steps 4000"
-TUNING = {  # two fifths of the steps, or as many windows; measured as LIMITS are
+TUNING = {  # two fifths of the older recipe's steps, or as many windows; measured as LIMITS are
     "4000-steps": SHORT,
     "lr-5e-4": f"{SHORT} --lr 5e-4",
     "lr-2e-3": f"{SHORT} --lr 2e-3",
@@ -79,9 +79,9 @@ TUNING = {  # two fifths of the steps, or as many windows; measured as LIMITS ar
 }
 VARIANTS = {**METHOD, **LIMITS, **TUNING}
 
-SEED = 1  # of the evaluation's goals: that of no training, and of no choice that was made
-EPISODES = 50
-AGAIN = "-goals2"  # the same report on 50 other goals
+SEED = 1  # of the evaluation's goals, by which nothing was chosen since 2026-11-27
+EPISODES = 20  # of a task
+AGAIN = "-goals2"  # the same report on as many other goals
 
 EVERY = tuple(METHOD)
 READS = ("dami", "no-inner-loop")  # a demonstration: may go without the instruction
@@ -94,26 +94,27 @@ REPORTS = {  # name -> command, and the variants that it measures; {run} is a ru
     "told": ("evaluate.py --checkpoint {run} --swap demonstration instruction", READS),
     "swap": ("evaluate.py --checkpoint {run} --without instruction --swap demonstration", READS),
     "one-shot": ("evaluate.py --checkpoint {run} --split novel --without instruction", READS),
-    "top": ("evaluate.py --checkpoint {run} --top 5 --episodes 20", ("neither",)),
+    "top": ("evaluate.py --checkpoint {run} --top 5", ("neither",)),
     "alone": ("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
     f"base{AGAIN}": ("evaluate.py --checkpoint {run} --seed 2", DECIDE),
     f"novel{AGAIN}": ("finetune.py --task novel --checkpoint {run} --seed 2", DECIDE),
     "limits": ("evaluate.py --checkpoint {run} --seed 10", (*LONGER, *LIMITS, *TUNING)),
 }
-CURVE = {  # along the adaptation, and with fewer demonstrations: 20 episodes; more of finetune.py
+CURVE = {  # along the adaptation, and with fewer demonstrations; flags of finetune.py
     "curve": "--curve 1 5 20 50",
     "long": "--steps 1000 --curve 500",
     "1-shot": "--demonstrations 1",
     "3-shot": "--demonstrations 3",
     "5-shot": "--demonstrations 5",
 }
-for name, flags in CURVE.items():
-    REPORTS[name] = (f"finetune.py --task novel --checkpoint {{run}} --episodes 20 {flags}", SHOWN)
+REPORTS |= {
+    name: (f"finetune.py --task novel --checkpoint {{run}} {flags}", SHOWN)
+    for name, flags in CURVE.items()
+}
 
-
-# Where goals are hidden: who reads a demonstration, and who is adapted by inner steps. Those who
-# read none have the same batches. A step without inner step takes a fifth of the time of one with,
-# so that "neither-as-long" has as many minutes as "inner".
+# Where goals are hidden. Some variants read a demonstration; those that read none have the same
+# batches, and some of them take inner steps. A step without inner step takes a fifth of the time of
+# one with, so that "neither-as-long" has as many minutes as "inner" on reach.
 NO_DEMONSTRATION = "--demo-encoder none --tasks-per-step 12 --support 8 --query 4 --lr 1e-3"
 INNER = (
     f"{NO_DEMONSTRATION} --pretrain-fraction 0.2 --vectorize 12 --learn-inner-lr --inner-lr 3e-2"
@@ -212,6 +213,7 @@ def unnamed_reports(suite: str) -> dict[str, tuple[str, Sequence[str]]]:
     return reports
 
 
+HIDDEN_SUITES = ("goals-reach", "goals-push", "goals-pick-place")
 UNNAMED_SUITES = ("pairs", "convention-reach", "convention-push")
 UNNAMED_REPORTS = {suite: unnamed_reports(suite) for suite in UNNAMED_SUITES}
 
@@ -227,9 +229,10 @@ class Plan:
 
 def plan_of(suite: str) -> Plan:
     """The plan of a suite: that of hidden goals, of tasks without a name, or of ML10 and ML45."""
-    if suite.startswith("goals-"):
+    choose(suite, ("ml10", "ml45", *HIDDEN_SUITES, *UNNAMED_SUITES), "suite")
+    if suite in HIDDEN_SUITES:
         return Plan(HIDDEN_METHOD, HIDDEN_REPORTS, episodes=5)
-    if suite in UNNAMED_REPORTS:
+    if suite in UNNAMED_SUITES:
         return Plan(UNNAMED_METHOD, UNNAMED_REPORTS[suite], episodes=20)
     return Plan(VARIANTS, REPORTS, episodes=EPISODES)
 
@@ -239,8 +242,17 @@ class Job:
     """A command whose result is a file."""
 
     command: str
-    done: Path
+    result: Path
     log: Path
+    measures: Path | None = None  # the checkpoint, if the job is a report
+
+    def is_done(self) -> bool:
+        """Whether its result exists, and is not of an earlier training."""
+        if self.measures is None or not self.result.exists():
+            return self.result.exists()
+        return (
+            self.measures.exists() and self.measures.stat().st_mtime <= self.result.stat().st_mtime
+        )
 
     def run(self) -> int:
         """Runs it in a process; returns the exit code."""
@@ -257,10 +269,13 @@ def steps_of(suite: str, flags: str) -> int:
     return int(given[-1]) if given else preset_settings("small", suite).steps
 
 
-def jobs_of_run(variant: str, seed: int, *, suite: str, flags: str, episodes: int) -> list[Job]:
+def jobs_of_run(
+    variant: str, seed: int, *, suite: str, flags: str, episodes: int, only: Sequence[str] | None
+) -> list[Job]:
     """The jobs of a run in their order: its training, then the reports that measure it.
 
-    `flags` are those of the training, beside the variant's.
+    `flags` are those of the training, beside the variant's; of the reports `only` some are made, or
+    all of the plan.
     """
     plan = plan_of(suite)
     flags = f"{plan.variants[variant]} {flags}"
@@ -279,9 +294,10 @@ def jobs_of_run(variant: str, seed: int, *, suite: str, flags: str, episodes: in
         f"{world}train.py --suite {suite} --preset small --seed {seed} --episodes 0 "
         f"--out {run} --threads 1 --clip-weights random {flags}{resume}"
     )
-    jobs = [Job(training, done=run / f"ema-{steps:05d}.pt", log=log)]
+    checkpoint = run / f"ema-{steps:05d}.pt"
+    jobs = [Job(training, result=checkpoint, log=log)]
     for name, (command, variants) in plan.reports.items():
-        if variant not in variants:
+        if variant not in variants or (only and name not in only):
             continue
         out = Path(f"{run}-{name}")
         script, report_flags = command.format(run=run).split(" ", 1)
@@ -289,23 +305,27 @@ def jobs_of_run(variant: str, seed: int, *, suite: str, flags: str, episodes: in
             f"{world}{script} --episodes {episodes} --seed {SEED} {report_flags}{data} "
             f"--workers 1 --threads 1 --out {out} --overwrite"
         )
-        jobs.append(Job(report, done=out / "success.json", log=log))
+        jobs.append(Job(report, result=out / "success.json", log=log, measures=checkpoint))
     return jobs
 
 
-def run_in_order(jobs: Sequence[Job], stopped: threading.Event) -> None:
-    """Runs jobs one after the other, up to one that fails or until `stopped` is set.
+def run_in_order(jobs: Sequence[Job], stopped: threading.Event) -> int:
+    """Runs the jobs of a run one after the other, until `stopped` is set; returns how many failed.
 
-    Those whose result exists are skipped.
+    Those that are done are skipped. If the training fails, there is nothing to measure.
     """
+    failed = 0
     for job in jobs:
-        if job.done.exists() or stopped.is_set():
+        if job.is_done() or stopped.is_set():
             continue
         code = job.run()
         outcome = "done" if code == 0 else f"exit code {code}"
         print(f"{outcome}: {job.command}", flush=True)
         if code != 0:
-            return  # what comes after needs it
+            failed += 1
+            if job.measures is None:
+                break
+    return failed
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -314,7 +334,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of training")
     parser.add_argument("--suite", default="ml10", help="such as ml10 or goals-reach (ml10)")
     parser.add_argument("--flags", default="", help="more flags of each training")
-    parser.add_argument("--episodes", type=int, help="a task (50, and 5 or 20 in other suites)")
+    parser.add_argument("--episodes", type=int, help="a task (20; where goals are hidden 5)")
+    parser.add_argument("--reports", nargs="+", help="these reports, such as base novel (all)")
     parser.add_argument("--at-once", type=int, default=2, help="runs at a time")
     parser.add_argument("--list", action="store_true", help="only say what is done")
     args = parser.parse_args(argv)
@@ -323,23 +344,29 @@ def main(argv: Sequence[str] | None = None) -> None:
     variants = args.only or list(plan.variants)
     for variant in variants:
         choose(variant, plan.variants, "variant")
+    for report in args.reports or ():
+        choose(report, plan.reports, "report")
 
     episodes = args.episodes or plan.episodes
     runs = [
-        jobs_of_run(variant, seed, suite=args.suite, flags=args.flags, episodes=episodes)
+        jobs_of_run(
+            variant, seed, suite=args.suite, flags=args.flags, episodes=episodes, only=args.reports
+        )
         for seed in args.seeds
         for variant in variants
     ]
     if args.list:
         for job in chain.from_iterable(runs):
-            print(f"{'done' if job.done.exists() else '    '}  python {job.command}")
+            print(f"{'done' if job.is_done() else '    '}  python {job.command}")
         return
     stopped = threading.Event()
     with ThreadPoolExecutor(args.at_once) as pool:
         try:
-            list(pool.map(partial(run_in_order, stopped=stopped), runs))
+            failed = sum(pool.map(partial(run_in_order, stopped=stopped), runs))
         finally:
             stopped.set()
+    if failed:
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -355,7 +355,7 @@ def test_an_unknown_or_contradictory_policy_is_refused_in_one_line(tmp_path):
     model.save(tmp_path / "a.pt", new_policy("flow"))
     info = torch.load(tmp_path / "a.pt", weights_only=True)
     for config, message in (
-        ({"policy": "fast"}, "policy is 'fast'; use one of dami, dp3, flow, mamba, freq"),
+        ({"policy": "fast"}, "policy 'fast' is unknown: import the file that adds it"),
         ({"demo_encoder": "vmt"}, "flow needs demo_encoder 'none', not 'vmt'"),
         ({"sampler": "dp3"}, "flow needs sampler 'ddim', not 'dp3'"),
         ({"policy": "freq"}, "freq needs denoiser 'frequency-transformer', not 'unet'"),

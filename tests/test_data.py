@@ -369,7 +369,7 @@ BAD_PARTS = [
     ({"meta": "[" * 100_000}, "meta is no JSON"),
     *(
         (meta(success_frames=wrong), "success_frames must")
-        for wrong in ([1], [1, 2, 3], [1, "2"], [1, -1], 1)
+        for wrong in ([1], [1, 2, 3], [1, "2"], [1, -1], [1, 30], 1)
     ),
     *((meta(positions_in_state=wrong), "positions_in_state is") for wrong in (4, -1, "3", True)),
     ({"action": np.zeros((30, 2), np.float32), **meta(positions_in_state=1)}, "a displacement"),

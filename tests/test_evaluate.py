@@ -399,6 +399,7 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
             recording=recordings[task],
             n_demonstrations=2,
             text=np.zeros(512, np.float32).tobytes(),
+            demonstration_control=None,
             inner_steps=0,
             inner_lr=None,
             support=None,
@@ -408,7 +409,6 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
             simulator=Watched(),
             task=task,
             seeds=[simulator.evaluation_seed(0, episode)],
-            demonstration_control=None,
             reference_seed=None,
             stop_at_success=True,
         )
@@ -908,7 +908,6 @@ def test_a_movie_is_written_by_what_is_there(monkeypatch):
         ("--inner-steps 1 --inner-lr nan", "--inner-lr is nan: use a number from 0"),
         ("--top -1", "--top is -1: use at least 0"),
         ("--top 5", "holds 2 checkpoints, fewer than --top"),
-        ("--swap instruction --top 2", "leave out --top"),
         ("--swap instruction --known-goals", "leave out --swap"),
         ("--swap instruction --task touch-red", "name two --task"),
         ("--swap instruction --task touch-red touch-red", "name two --task"),

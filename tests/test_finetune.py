@@ -148,8 +148,8 @@ def test_two_steps_of_adaptation_are_two_of_plain_adamw_on_gradients_clipped_to_
     assert min(norms) > 1 and max(norms) > 1.05 * min(norms)  # AdamW does not feel a common factor
 
 
-@pytest.mark.parametrize("learned", [False, True])
-def test_inner_steps_are_steps_of_plain_gradient_descent_on_one_batch(learned):
+@pytest.mark.parametrize("learned, control", [(False, None), (True, None), (False, "zeros")])
+def test_inner_steps_are_steps_of_plain_gradient_descent_on_one_batch(learned, control):
     torch.manual_seed(0)
     policy = model.DAMIPolicy(model.PRESETS["tiny"]).double()
     recording = own_recording(400, ends=[200, 400]) | {"meta": {}}
@@ -166,10 +166,14 @@ def test_inner_steps_are_steps_of_plain_gradient_descent_on_one_batch(learned):
         batch=4,
         lr=dict(zip(names, rates)) if learned else 0.02,
         seed=7,
+        demonstration_control=control,
     )
 
     plain, generator = copy.deepcopy(policy), torch.Generator().manual_seed(7)
     batch = sampler.batch(4, generator) | plain.draw_noise_and_timesteps(4, generator)
+    if control == "zeros":
+        for name in ("demo_points", "demo_state", "demo_action"):
+            batch[name] = torch.zeros_like(batch[name])
     for k, (step, loss, adapted) in enumerate(adapting):
         gradients = torch.autograd.grad(
             plain.loss(text=text[None], **batch), list(plain.parameters())

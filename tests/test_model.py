@@ -1001,7 +1001,7 @@ def test_a_policy_that_reads_a_task_does_not_act_without_one():
         ({"horizon": 15}, "horizon 15 is no multiple of 2: it is halved between the 2 levels"),
         (
             {"horizon": 4},
-            "n_action_steps is 8: of horizon 4 there are 3 actions after n_obs_steps 2",
+            "n_action_steps is 8: of horizon 4 there are 3 actions from the newest of n_obs_steps",
         ),
     ],
 )

@@ -244,7 +244,7 @@ def test_a_run_that_was_resumed_ends_with_the_same_weights(point_suite, monkeypa
     [
         (["--resume", "--out", "nothing"], "there is no run to resume"),
         (["--out", "run"], "add --resume, or another --out"),
-        (["--resume", "--out", "run", "--hidden", "9"], "trained with other settings"),
+        (["--resume", "--out", "run", "--hidden", "9"], "trained with other settings (hidden"),
         (["--resume", "--out", "damaged"], "is damaged"),
         (["--resume", "--out", "foreign"], "is of no run of rl.py"),
         (["--out", "results"], "already holds results: choose another --out"),

@@ -642,7 +642,7 @@ class Repeats:
 def test_all_rollouts_of_a_task_hold_one_demonstration_and_are_played_one_at_a_time(monkeypatch):
     small_suite(monkeypatch, episodes=4)  # of different lengths, by which they are told apart
     policy = Repeats()
-    monkeypatch.setattr(evaluate, "load_trained", lambda *_, **__: (policy, {}))
+    monkeypatch.setattr(evaluate, "load_trained", lambda *_, **__: (policy, {"arguments": {}}))
     jobs = []
 
     def run_here(job, listed, **_):

@@ -862,6 +862,19 @@ def test_the_gripper_initializes_moves_and_tells_where_it_is(emulator, settings)
     gripper.close()
 
 
+def test_an_adapter_that_is_pulled_out_is_a_gripper_that_fails(emulator, settings):
+    termios = pytest.importorskip("termios")
+
+    def pulled_out():
+        raise termios.error(5, "Input/output error")
+
+    gripper = Gripper(settings, "127.0.0.1")
+    gripper.port = SimpleNamespace(reset_input_buffer=pulled_out)  # as pyserial's does
+    with pytest.raises(RobotError, match=r"the gripper at .*Input/output error"):
+        gripper.read()
+    gripper.close()
+
+
 def test_a_late_answer_is_not_taken_for_the_next_one(emulator, settings):
     gripper = Gripper(settings, "127.0.0.1", timeout=0.1)
     gripper.initialize()
@@ -1363,7 +1376,7 @@ def test_recording_keeps_finished_episodes_and_drops_the_others(
     [
         ({"hand": 0.3}, "dropped: a step jumps by"),
         ({"pose": [0.3, *START_POSE[1:]]}, "dropped: the TCP is outside its box, at 0.3"),
-        ({"silent": 1}, "s apart, camera or gripper were late"),
+        ({"silent": 1}, "s: camera or gripper were late"),
     ],
 )
 def test_an_episode_that_run_would_refuse_is_not_kept(
@@ -1385,6 +1398,16 @@ def test_an_episode_that_run_would_refuse_is_not_kept(
     printed = capsys.readouterr().out
     assert message in printed and "nothing was recorded" in printed
     assert not Path("demos/stack-cube.npz").exists()
+
+
+def test_the_gripper_is_recorded_as_told_after_a_frame_that_does_not_show_it_yet():
+    cell = SimpleNamespace(observe=lambda: "frame")
+    servo = SimpleNamespace(check=lambda: None, moves=False)
+    recorder = robot.Recorder(args=None, cell=cell, out=None, meta={}, kept=None)
+    for key in ("s", "", "g", "", "g"):  # in the order in which `record` does it
+        recorder.observe()
+        recorder.press(key, servo)
+    assert recorder.grip == [0, 1, 1, 0] and len(recorder.frames) == 4
 
 
 def test_a_gripper_that_is_closed_is_recorded_as_closed(emulator, cell, monkeypatch):
@@ -1551,7 +1574,7 @@ def test_running_moves_the_arm_within_its_limits_and_ends_with_a_stop(
 ):
     assert ends([*running, "--seconds", "1"]) == 0, capsys.readouterr().err
     printed = capsys.readouterr().out
-    assert "stack-cube: run" in printed and "packets at 125 Hz" in printed
+    assert "stack-cube: run" in printed and "packages at 125 Hz" in printed
     assert np.linalg.norm(np.subtract(emulator.pose, START_POSE)[:3]) > 1e-3
     assert emulator.registers[0x0200] == 1
     assert any(frame[3] == 3 for frame in emulator.gripper_frames)
@@ -1582,6 +1605,13 @@ def test_the_first_frames_are_seen_after_the_gripper_is_ready(emulator, settings
     assert ends([*running, "--seconds", "0.5"]) == 0
     assert the_log().state[0, 1] == pytest.approx(START_POSE[1] + 0.12, abs=0.005)
     assert_within_limits(emulator, settings)
+
+
+def test_the_gripper_stays_as_it_is_if_the_arm_may_not_start(emulator, running, capsys):
+    emulator.pose[0] = 0.25
+    assert ends([*running, "--seconds", "0.5"]) == 2
+    assert "outside its box" in capsys.readouterr().err
+    assert emulator.registers[0x0200] == 0  # not initialized: it would have opened and closed
 
 
 def test_a_start_pose_is_reached_slowly(emulator, settings, running):

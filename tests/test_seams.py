@@ -201,7 +201,8 @@ def test_training_where_no_observation_tells_the_task_ends_with_what_tells_it(
     rollout_job, rollout = evaluate.rollout_job, evaluate.rollout
 
     def watched_job(**arguments):
-        measured.append((arguments["demonstration_control"], arguments["wanted"].inner_steps))
+        wanted = arguments["wanted"]
+        measured.append((wanted.demonstration_control, wanted.inner_steps))
         return rollout_job(**arguments)
 
     def watched_rollout(policy, *arguments, **options):
