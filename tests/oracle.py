@@ -6,8 +6,9 @@
     python -m tests.oracle pixels train.py --suite ml10 --data data-pixels --out runs/pixels
 
 `positions`: the state also holds where the object and the goal truly are. `pixels`: the camera
-casts four times as many rays. Both are simulators of their own, whose recordings fit no other one.
-A checkpoint does not say in which world it was trained: measure it in the same.
+casts four times as many rays. `marker`: the goals of hidden_goals.py can be seen. These are
+simulators of their own, whose recordings fit no other one; but a checkpoint does not say in which
+world it was trained.
 `augmented-twice`: scenes are turned and stretched up to twice as much in training.
 `not-averaged`: what is kept are the weights themselves, in place of their moving average.
 """
@@ -30,6 +31,7 @@ import simulator
 import train
 from clip import TextWeightsError
 from common import command_line
+from hidden_goals import SKILLS, HiddenGoalEnv, HiddenGoals
 from metaworld_env import (
     CAMERA,
     CAMERA_PIXELS,
@@ -80,6 +82,21 @@ class MetaWorldWithPixels(MetaWorld):
         return EnvWithPixels(task, num_points, episode_steps=self.episode_steps)
 
 
+class EnvWithMarker(HiddenGoalEnv):
+    hidden_sites = ()
+
+
+@dataclass(frozen=True)
+class HiddenGoalsWithMarker(HiddenGoals):
+    """The goal's marker is in the cloud."""
+
+    name: ClassVar[str] = "meta-world, goals that can be seen"
+    recipe: ClassVar[dict] = {**HiddenGoals.recipe, "simulator": name}
+
+    def make(self, task: str, num_points: int) -> EnvWithMarker:
+        return EnvWithMarker(task, num_points, episode_steps=self.episode_steps)
+
+
 # ---- Worlds --------------------------------------------------------------------------------------
 
 
@@ -91,6 +108,11 @@ def positions() -> None:
 def pixels() -> None:
     for suite in ("ml10", "ml45"):
         simulator.SIMULATORS[suite] = MetaWorldWithPixels
+
+
+def marker() -> None:
+    for skill in SKILLS:
+        simulator.SIMULATORS[f"goals-{skill}"] = HiddenGoalsWithMarker
 
 
 def augmented_twice() -> None:
@@ -106,6 +128,7 @@ def not_averaged() -> None:
 WORLDS = {
     "positions": positions,
     "pixels": pixels,
+    "marker": marker,
     "augmented-twice": augmented_twice,
     "not-averaged": not_averaged,
 }

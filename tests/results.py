@@ -22,7 +22,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 import model
-from common import command_line, format_table, read_json_lines
+from common import UserError, command_line, format_table, read_json_lines
 from data import write_text
 from evaluate import SHIPPED_CHECKPOINT, TRAINED, checkpoints_of, load_trained
 from model import CheckpointError
@@ -40,10 +40,11 @@ from report import (
 )
 from simulator import simulator_of
 from tests.runs import AGAIN, HIDDEN_REPORTS, REPORTS, UNNAMED_REPORTS
-from unnamed_tasks import DIRECTIONS, SCENES
+from unnamed_tasks import ANGLES, DIRECTIONS, SCENES, turned_task
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "assets" / "RESULTS.json"
+PAGES = ("README.md", "RESULTS.md")
 PAPER = json.loads(PAPER_RESULTS.read_text())
 
 
@@ -60,33 +61,25 @@ DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022); the
     "hard": "assembly hand-insert pick-out-of-hole pick-place push push-back",
     "very hard": "disassemble pick-place-wall shelf-place stick-pull stick-push",
 }
+# Runs whose names begin with "old-" had the camera and the recipe of 2026-11-27.
 VARIANTS = {  # a run's name without its seed -> what it is
-    "ml10-dami": "DAMI",
-    "ml10-first-order": "DAMI, first order",
-    "ml10-first-order-3e-2": "DAMI, first order, with an inner rate of 3e-2",
-    "ml10-dami-cpu": "DAMI, trained on the CPU",
-    "ml10-no-inner-loop": "without the inner loop",
-    "ml10-no-inner-loop-cpu": "without the inner loop, trained on the CPU",
-    "ml10-mlp": "without the inner loop, an MLP for VMT",
-    "ml10-no-demonstration": "without a demonstration",
-    "ml10-neither": "without both: multi-task training",
-    "ml10-30-demonstrations": "multi-task training, thirty demonstrations",
-    "ml10-scratch": "from random weights",
-    "ml45-no-inner-loop": "ML45, without the inner loop",
-}
-OLDER = {  # the same of earlier recipes
-    "ml10-scratch-eight": "from random weights",
-    "ml10-dami-eight": "DAMI",
-    "ml10-inner-3e-2": "DAMI with an inner rate of 3e-2",
-    "ml10-no-inner-loop-eight": "without the inner loop",
-    "ml10-neither-eight": "multi-task training",
-    "before": "DAMI, until 2026-11-23",
-    "before-no-inner-loop": "without the inner loop, until 2026-11-23",
+    "old-ml10-dami": "DAMI",
+    "old-ml10-first-order": "DAMI, first order",
+    "old-ml10-first-order-3e-2": "DAMI, first order, with an inner rate of 3e-2",
+    "old-ml10-dami-cpu": "DAMI, trained on the CPU",
+    "old-ml10-no-inner-loop": "without the inner loop",
+    "old-ml10-no-inner-loop-cpu": "without the inner loop, trained on the CPU",
+    "old-ml10-mlp": "without the inner loop, an MLP for VMT",
+    "old-ml10-no-demonstration": "without a demonstration",
+    "old-ml10-neither": "without both: multi-task training",
+    "old-ml10-30-demonstrations": "multi-task training, thirty demonstrations",
+    "old-ml10-scratch": "from random weights",
+    "old-ml45-no-inner-loop": "ML45, without the inner loop",
 }
 SWAPPED = {  # a run -> its panel in the swap chart
     "before-seed0": "instruction never left out",
-    "ml10-dami-seed0": "DAMI",
-    "ml10-no-inner-loop-cpu-seed0": "no inner loop, on the CPU",
+    "old-ml10-dami-seed0": "DAMI",
+    "old-ml10-no-inner-loop-cpu-seed0": "no inner loop, on the CPU",
 }
 POLICIES = {  # of baselines.py -> what the paper calls it
     policy: name for policy, name in PAPER_NAMES.items() if policy not in ("dami", "rl")
@@ -119,19 +112,21 @@ TUNING = {  # a short multi-task training -> what it is
     "augmented-twice": "scenes turned and stretched twice as much",
     "not-averaged": "the last weights, not their moving average",
 }
-SHOWN = {  # a suite -> the columns of its tables: a variant, and what it is called there
-    "ml10": {
-        "ml10-dami": "DAMI",
-        "ml10-no-inner-loop": "no inner loop",
-        "ml10-no-demonstration": "no demonstration",
-        "ml10-neither": "multi-task",
+# A group (a suite, or "old-" and a suite) -> the columns of its tables: a variant, and its title.
+SHOWN = {
+    "ml10": {"ml10-dami": "DAMI", "ml10-neither": "multi-task"},
+    "old-ml10": {
+        "old-ml10-dami": "DAMI",
+        "old-ml10-no-inner-loop": "no inner loop",
+        "old-ml10-no-demonstration": "no demonstration",
+        "old-ml10-neither": "multi-task",
     },
-    "ml45": {
-        "ml45-dami": "DAMI",
-        "ml45-no-inner-loop": "no inner loop",
-        "ml45-no-demonstration": "no demonstration",
-        "ml45-neither": "multi-task",
-        "ml45-dp3": "DP3",
+    "old-ml45": {
+        "old-ml45-dami": "DAMI",
+        "old-ml45-no-inner-loop": "no inner loop",
+        "old-ml45-no-demonstration": "no demonstration",
+        "old-ml45-neither": "multi-task",
+        "old-ml45-dp3": "DP3",
     },
 }
 
@@ -140,8 +135,8 @@ SHOWN = {  # a suite -> the columns of its tables: a variant, and what it is cal
 class Column:
     """A column of a report (a name of `tests.runs.REPORTS`).
 
-    It is told by its place or by its name: the whole of it, or what stands in it behind a
-    checkpoint and a comma, such as "zeros".
+    `column` is its place, its title, or what its title ends with behind a comma: "zeros" finds
+    "goals-reach-demonstration-seed0/ema-01500, zeros".
     """
 
     report: str
@@ -153,6 +148,9 @@ class Column:
 BASE, BEFORE, AFTER = Column("base"), Column("novel", "before"), Column("novel", "after")
 MEASURED_BY = {"base": BASE, "novel": AFTER}  # the tasks of a split
 
+# The names of all reports, each once and in their order.
+REPORT_NAMES = tuple(dict.fromkeys(chain(REPORTS, HIDDEN_REPORTS, *UNNAMED_REPORTS.values())))
+
 Results = dict[str, dict[str, Any]]  # a run's name -> "training", and its reports by their names
 
 
@@ -162,12 +160,22 @@ Results = dict[str, dict[str, Any]]  # a run's name -> "training", and its repor
 def take(results: Results, run: Path) -> None:
     """Adds a run's training and the reports beside its folder to `results`.
 
-    A folder of `tests.controls`, which trains nothing, and one of rl.py are their own reports.
+    Reports that `results` has already, of the same training, stay where no folder has newer ones. A
+    folder of `tests.controls`, which trains nothing, and one of rl.py are their own reports.
+
+    Raises UserError for any other folder.
     """
-    if (run / "success.json").exists() and not (run / "config.json").exists():
-        results[run.name] = {"novel": read_report(run)}
-        return
-    steps = [line for line in read_json_lines(run / "metrics.jsonl") if "loss" in line]
+    if (run / "success.json").exists():
+        report = read_report(run)
+        command = report["provenance"]["command"]
+        if "tests.controls" in command or "rl.py" in command:
+            results[run.name] = {"novel": report}
+            return
+    steps = []
+    if (run / "config.json").exists():
+        steps = [line for line in read_json_lines(run / "metrics.jsonl") if "loss" in line]
+    if not steps:
+        raise UserError(f"{run} is no run of train.py, tests.controls or rl.py")
     training = {
         "minutes": round(steps[-1]["seconds"] / 60, 1),
         **json.loads((run / "config.json").read_text()),
@@ -178,9 +186,10 @@ def take(results: Results, run: Path) -> None:
             "before": round(float(np.mean([line["loss_before"] for line in inner_steps])), 5),
             "after": round(float(np.mean([line["loss"] for line in inner_steps])), 5),
         }
-    results[run.name] = {"training": training}
-    of_plans = (REPORTS, HIDDEN_REPORTS, *UNNAMED_REPORTS.values())
-    for name in dict.fromkeys(chain.from_iterable(of_plans)):  # each name once, in their order
+    earlier = results.get(run.name, {})
+    kept = earlier if earlier.get("training") == training else {}
+    results[run.name] = {**kept, "training": training}
+    for name in REPORT_NAMES:
         folder = Path(f"{run}-{name}")
         if (folder / "success.json").exists():
             results[run.name][name] = read_report(folder)
@@ -214,7 +223,8 @@ def as_digits(episodes: Sequence[bool]) -> str:
 
 def runs_of(results: Results, variant: str) -> list[dict]:
     """The runs of a variant, one a seed."""
-    return [run for name, run in sorted(results.items()) if name.rsplit("-seed")[0] == variant]
+    name_of_run = re.compile(rf"{re.escape(variant)}(-seed\d+)?")
+    return [run for name, run in sorted(results.items()) if name_of_run.fullmatch(name)]
 
 
 def measured(run: dict, column: Column) -> Successes | None:
@@ -294,59 +304,82 @@ def paper_cells(suite: str, split: str, tasks: Sequence[str] | None = None) -> l
     return [paper_mean(suite, split, policy, tasks) for policy in ("DP3", "DAMI")]
 
 
-def head(suite: str, title: str) -> list[str]:
-    """The first row of a table of a suite's variants."""
-    return [title, *SHOWN[suite].values(), "paper, DP3", "paper, DAMI"]
+def variants_of(results: Results, group: str) -> dict[str, str]:
+    """A group of SHOWN, as far as there are runs."""
+    return {variant: title for variant, title in SHOWN[group].items() if runs_of(results, variant)}
 
 
-def means_table(results: Results, suite: str = "ml10") -> str:
-    """The means of each variant that is shown, and the paper's."""
-
-    def row(title: str, column: Column, paper: list[str]) -> list[str]:
-        return [title, *(mean(results, variant, column) for variant in SHOWN[suite]), *paper]
-
-    return format_table(
-        [
-            head(suite, suite.upper()),
-            row("base tasks", BASE, paper_cells(suite, "base")),
-            row("novel tasks, no gradient step", BEFORE, ["", ""]),
-            row("novel tasks, 200 steps", AFTER, paper_cells(suite, "novel")),
-        ]
-    )
+def head(results: Results, group: str, title: str) -> list[str]:
+    """The first row of a table of a group."""
+    return [title, *variants_of(results, group).values(), "paper, DP3", "paper, DAMI"]
 
 
-def by_task_table(results: Results, split: str, suite: str = "ml10") -> str:
+def suite_of(group: str) -> str:
+    """The suite of a group of SHOWN."""
+    return group.removeprefix("old-")
+
+
+def means_table(results: Results, group: str) -> str:
+    """The means of each variant of a group, and the paper's, at any step and at the end."""
+    suite = suite_of(group)
+    rows = [head(results, group, suite.upper())]
+    for title, column, paper in (
+        ("base tasks", BASE, paper_cells(suite, "base")),
+        ("novel tasks, no gradient step", BEFORE, ["", ""]),
+        ("novel tasks, 200 steps", AFTER, paper_cells(suite, "novel")),
+    ):
+        rows.append(
+            [
+                title,
+                *(mean(results, variant, column) for variant in variants_of(results, group)),
+                *paper,
+            ]
+        )
+        at_end = replace(column, at_end=True)
+        cells = [mean(results, variant, at_end) for variant in variants_of(results, group)]
+        if any(cells):
+            rows.append([f"{title}, at the end", *cells, "", ""])
+    return format_table(rows)
+
+
+def by_task_table(results: Results, split: str, group: str) -> str:
     """A row a task: each variant's seeds together, and the paper's."""
-    column = MEASURED_BY[split]
-    rows = [head(suite, "task")]
+    suite, column = suite_of(group), MEASURED_BY[split]
+    rows = [head(results, group, "task")]
     for task in TASKS[suite][split]:
-        cells = [pooled(results, variant, column, [task]) for variant in SHOWN[suite]]
+        cells = [
+            pooled(results, variant, column, [task]) for variant in variants_of(results, group)
+        ]
         rows.append([task, *cells, *paper_cells(suite, split, [task])])
-    means = [mean(results, variant, column) for variant in SHOWN[suite]]
+    means = [mean(results, variant, column) for variant in variants_of(results, group)]
     rows.append(["**mean**", *means, *paper_cells(suite, split)])
     return format_table(rows)
 
 
-def difficulty_table(results: Results, suite: str = "ml10") -> str:
+def difficulty_table(results: Results, group: str) -> str:
     """A row for the base tasks, and one for the novel tasks, of each difficulty."""
+    suite = suite_of(group)
     difficulty_of = {task: name for name, tasks in DIFFICULTY.items() for task in tasks.split()}
-    rows = [head(suite, "tasks")]
+    rows = [head(results, group, "tasks")]
     for split, column in MEASURED_BY.items():
         for difficulty in ("easy", *DIFFICULTY):
             tasks = [t for t in TASKS[suite][split] if difficulty_of.get(t, "easy") == difficulty]
             if tasks:
-                cells = [pooled(results, variant, column, tasks) for variant in SHOWN[suite]]
+                cells = [
+                    pooled(results, variant, column, tasks)
+                    for variant in variants_of(results, group)
+                ]
                 title = f"{split}, {difficulty} ({len(tasks)})"
                 rows.append([title, *cells, *paper_cells(suite, split, tasks)])
     return format_table(rows)
 
 
-def variants_table(results: Results, variants: dict[str, str]) -> str:
+def variants_table(results: Results) -> str:
     """What decides: a row a variant of ML10; ML45 has a table of its own."""
     rows = [["ML10", "base", "novel, no gradient step", "novel, 200 steps"]]
-    for variant, title in variants.items():
+    for variant, title in VARIANTS.items():
         cells = [mean(results, variant, column) for column in (BASE, BEFORE, AFTER)]
-        if any(cells) and not variant.startswith("ml45"):
+        if any(cells) and "ml45" not in variant:
             rows.append([title, *cells])
     return format_table(rows)
 
@@ -365,9 +398,10 @@ def policies_table(results: Results) -> str:
         ]
     ]
     of_dami = [f"- / {paper_mean('ml10', split, 'DAMI')}" for split in ("base", "novel")]
-    rows.append(["DAMI", *with_and_without(results, "ml10-no-inner-loop", "ml10-dami"), *of_dami])
+    ours = with_and_without(results, "old-ml10-no-inner-loop", "old-ml10-dami")
+    rows.append(["DAMI", *ours, *of_dami])
     for policy, name in POLICIES.items():
-        ours = with_and_without(results, f"ml10-{policy}", f"ml10-{policy}-maml")
+        ours = with_and_without(results, f"old-ml10-{policy}", f"old-ml10-{policy}-maml")
         paper = []
         for split, table in (("base", "base_maml_avg"), ("novel", "novel_maml")):
             with_maml = np.mean(PAPER["ml10"][table][name])
@@ -389,7 +423,7 @@ def ablation_table(results: Results) -> str:
     """The rows of the paper's ablation, each with its mean there."""
     rows = [["ML10, without the inner loop", "base", "novel", "paper, novel"]]
     for name, (variant, title) in ABLATION.items():
-        cells = [mean(results, f"ml10-{variant}", column) for column in (BASE, AFTER)]
+        cells = [mean(results, f"old-ml10-{variant}", column) for column in (BASE, AFTER)]
         rows.append([title, *cells, f"{np.mean(PAPER['ml10']['novel_ablation'][name]):.1f}"])
     return format_table(rows)
 
@@ -419,7 +453,7 @@ def limits_table(results: Results, titles: dict[str, str], first: str) -> str:
     They are measured on goals that no other result has. `first` is the title of the first column.
     """
     successes = {
-        variant: measured(results.get(f"ml10-{variant}-seed0", {}), Column("limits"))
+        variant: measured(results.get(f"old-ml10-{variant}-seed0", {}), Column("limits"))
         for variant in titles
     }
     plain = successes[next(iter(titles))]
@@ -468,23 +502,11 @@ def swap_table(results: Results) -> str:
 def reading_table(results: Results) -> str:
     """A row a run that is told nothing: success with its own demonstration, with another task's."""
     rows = [["run", "own demonstration alone", "another's demonstration alone"]]
-    for variant, title in chain(VARIANTS.items(), OLDER.items()):
+    for variant, title in VARIANTS.items():
         for run in runs_of(results, variant):
             if "swap" in run:
                 cells = [pooled_success(measured(run, Column("swap", place))) for place in (0, 1)]
                 rows.append([f"{title}, seed {run['training']['arguments']['seed']}", *cells])
-    return format_table(rows)
-
-
-def looks_table(results: Results) -> str:
-    """A row a run that was also rolled out with eight actions of ten steps for four of five."""
-    rows = [["run", "base, 8 of 10", "base, 4 of 5", "novel, 8 of 10", "novel, 4 of 5"]]
-    for name, run in sorted(results.items()):
-        eight = results.get(name.replace("-seed", "-eight-seed"))
-        if eight is None or "base" not in eight or eight["training"] != run["training"]:
-            continue
-        cells = [pooled_success(measured(r, c)) for c in (BASE, AFTER) for r in (eight, run)]
-        rows.append([f"{VARIANTS[name.rsplit('-seed')[0]]}, seed {name[-1]}", *cells])
     return format_table(rows)
 
 
@@ -523,6 +545,7 @@ HIDDEN_ROWS = (
     ("multi-task, longer: 20 steps", "neither-as-long", Column("20-steps-best-rate")),
     ("demonstration and inner loop: before a step", "both", Column("novel", 0)),
     ("demonstration and inner loop: 1 inner step", "both", Column("1-steps")),
+    ("no demonstration, but the goal is seen", "marker", Column("0-steps")),
     ("no network: the demonstration's actions again", "controls", Column("novel", "replay")),
     ("no network: to the hand's last position", "controls", Column("novel", "servo")),
     ("the expert, who knows the goal", "controls", Column("novel", "expert")),
@@ -566,9 +589,32 @@ def hidden_summary_table(results: Results) -> str:
     return format_table(rows)
 
 
-# What is measured on pairs: a title, the variant, its report, and the column of that. None: the
-# report of each scene, in which a task is also shown the demonstration of the other one.
-PAIRS_ROWS = (
+NUMBERS_OF_GOALS = {  # goals of a training -> its variant, and where it was measured
+    5: ("demonstration-5-goals", Column("0-steps")),
+    20: ("demonstration-20-goals", Column("0-steps")),
+    40: ("demonstration-40-goals", Column("0-steps")),
+    80: ("demonstration-80-goals", Column("0-steps")),
+    160: ("demonstration", Column("novel")),
+    320: ("demonstration-320-goals", Column("0-steps")),
+}
+
+
+def numbers_of_goals_table(results: Results, skill: str) -> str:
+    """The success on novel goals with their demonstration, by the number of goals in training."""
+    rows = [[f"{skill}, goals in training", "at any step", "at the end"]]
+    for number, (variant, column) in NUMBERS_OF_GOALS.items():
+        name = f"goals-{skill}-{variant}"
+        cells = [mean(results, name, replace(column, at_end=at_end)) for at_end in (False, True)]
+        if any(cells):
+            rows.append([str(number), *cells])
+    return format_table(rows)
+
+
+# What is measured where no observation names the task: a title, the variant, its report, and the
+# column of that. Where the report is None, it is the one in which tasks are also shown the
+# demonstrations of others. It is called after its scene in pairs, and "angles" where actions are
+# turned.
+UNNAMED_ROWS = (
     ("its own demonstration", "demonstration", None, 0),
     ("its own demonstration without the actions", "demonstration", None, "no-actions"),
     ("another task's demonstration", "demonstration", None, SHOWN_ANOTHER),
@@ -577,6 +623,8 @@ PAIRS_ROWS = (
     ("the same, after one inner step", "inner", "1-steps", 0),
     ("the same, after five inner steps", "inner", "5-steps", 0),
     ("multi-task training", "neither", "multi-task", 0),
+    ("the same, after one step at its best rate", "neither", "1-steps-best-rate", 0),
+    ("the same, after five steps at their best rate", "neither", "5-steps-best-rate", 0),
 )
 
 
@@ -584,7 +632,7 @@ def pairs_table(results: Results) -> str:
     """A row for what a policy has; success at its task and at the other one, by scene."""
     head_cells = [f"{scene}, {which}" for scene in SCENES for which in ("its task", "the other")]
     rows = [["success at any step, percent", *head_cells]]
-    for title, variant, report, shown in PAIRS_ROWS:
+    for title, variant, report, shown in UNNAMED_ROWS:
         cells = []
         for scene in SCENES:
             tasks = [f"{scene}-{direction}-hidden" for direction in DIRECTIONS]
@@ -596,29 +644,46 @@ def pairs_table(results: Results) -> str:
     return format_table(rows)
 
 
+def turned_actions_table(results: Results, skill: str) -> str:
+    """A row for what a policy has: success on all new angles, and at the end on each of them."""
+    angles = ANGLES["novel"]
+    angle_cells = [f"{angle:g}" for angle in angles]
+    rows = [[f"{skill}, percent", "at any step", "at the end", *angle_cells]]
+    for title, variant, report, shown in UNNAMED_ROWS:
+        name = f"convention-{skill}-{variant}"
+        column = Column(report or "angles", shown)
+        at_end = replace(column, at_end=True)
+        cells = [pooled(results, name, column), pooled(results, name, at_end)]
+        for angle in angles:
+            episodes = together(results, name, at_end, [turned_task(skill, angle)])
+            cells.append(f"{100 * np.mean(episodes):.0f}" if episodes else "")
+        if any(cells):
+            rows.append([title, *cells])
+    return format_table(rows)
+
+
 TABLES: dict[str, Callable[[Results], str]] = {
-    "means": means_table,
-    "base": lambda results: by_task_table(results, "base"),
-    "novel": lambda results: by_task_table(results, "novel"),
-    "difficulty": difficulty_table,
-    "variants": lambda results: variants_table(results, VARIANTS),
-    "older": lambda results: variants_table(results, OLDER),
-    "policies": policies_table,
-    "ablation": ablation_table,
-    "length": length_table,
-    "limits": lambda results: limits_table(results, LIMITS, "given"),
-    "tuning": lambda results: limits_table(results, TUNING, "trained"),
-    "ml45 means": lambda results: means_table(results, "ml45"),
-    "ml45 difficulty": lambda results: difficulty_table(results, "ml45"),
-    "ml45 novel": lambda results: by_task_table(results, "novel", "ml45"),
-    "looks": looks_table,
     "goals": hidden_summary_table,
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
     "goals push": lambda results: hidden_goals_table(results, "push"),
     "goals pick-place": lambda results: hidden_goals_table(results, "pick-place"),
+    "goals reach numbers": lambda results: numbers_of_goals_table(results, "reach"),
     "pairs": pairs_table,
-    "swap": swap_table,
-    "reading": reading_table,
+    "turned actions": lambda results: turned_actions_table(results, "reach"),
+    "means": lambda results: means_table(results, "ml10"),
+    "base": lambda results: by_task_table(results, "base", "ml10"),
+    "novel": lambda results: by_task_table(results, "novel", "ml10"),
+    "old variants": variants_table,
+    "old swap": swap_table,
+    "old reading": reading_table,
+    "old policies": policies_table,
+    "old ablation": ablation_table,
+    "old ml45 means": lambda results: means_table(results, "old-ml45"),
+    "old ml45 difficulty": lambda results: difficulty_table(results, "old-ml45"),
+    "old ml45 novel": lambda results: by_task_table(results, "novel", "old-ml45"),
+    "old length": length_table,
+    "old limits": lambda results: limits_table(results, LIMITS, "given"),
+    "old tuning": lambda results: limits_table(results, TUNING, "trained"),
 }
 
 
@@ -705,7 +770,7 @@ def plot_adaptation(results: Results, path: Path) -> None:
                 list(episodes),
                 100 * rates,
                 yerr=100 * np.abs(np.array(bounds).T - rates),  # (2, points)
-                label=SHOWN["ml10"].get(variant, title),
+                label=SHOWN["old-ml10"].get(variant, title),
                 marker="o",
                 markersize=4,
                 capsize=2,
@@ -767,7 +832,7 @@ def plot_inner_steps(results: Results, skill: str, path: Path) -> None:
 def plot_by_task(results: Results, path: Path) -> None:
     """Writes a chart of success by task, of all seeds together, beside the paper's."""
     columns: dict[str, Successes] = {}
-    for variant, label in SHOWN["ml10"].items():
+    for variant, label in variants_of(results, "ml10").items():
         columns[label] = {
             task: together(results, variant, column, [task])
             for split, column in MEASURED_BY.items()
@@ -787,6 +852,7 @@ def compare(results: Results, one: str, other: str) -> str:
     """Episodes on the same goals that one variant wins and loses against another, seed by seed.
 
     A row a report that both have, of its column "after" or else its first; p: two-sided sign test.
+    Raises UserError for a variant of which there is no run.
     """
 
     def episodes_of(run: dict, report: str) -> Successes | None:
@@ -795,7 +861,10 @@ def compare(results: Results, one: str, other: str) -> str:
 
     rows = [["report", "won", "lost", "episodes", "p"]]
     names = [name for name in results if name.startswith(f"{one}-seed")]
-    for report in REPORTS:
+    for variant in (one, other):
+        if not runs_of(results, variant):
+            raise UserError(f"{RESULTS.name} has no run of {variant}")
+    for report in REPORT_NAMES:
         if report.endswith(AGAIN):  # these episodes are counted with those of the report itself
             continue
         outcomes = []
@@ -848,8 +917,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         write_text(RESULTS, json.dumps(results, indent=1) + "\n")
         return
 
-    for name in ("README.md", "RESULTS.md"):
-        write_text(ROOT / name, fill((ROOT / name).read_text(), results))
+    pages = {ROOT / name: fill((ROOT / name).read_text(), results) for name in PAGES}
+    for path, text in pages.items():
+        write_text(path, text)
     plot_swap(results, ROOT / "assets" / "swap.png")
     plot_by_task(results, ROOT / "assets" / "success.png")
     plot_inner_steps(results, "reach", ROOT / "assets" / "inner-steps.png")

@@ -13,12 +13,14 @@ from report import wilson_interval
 from simulator import SIMULATORS
 from tests.results import (
     HIDDEN_ROWS,
-    PAIRS_ROWS,
+    HIDDEN_SUMMARY,
+    NUMBERS_OF_GOALS,
     POLICIES,
     RESULTS,
     ROOT,
     TABLES,
     TASKS,
+    UNNAMED_ROWS,
     Column,
     compare,
     fill,
@@ -26,10 +28,12 @@ from tests.results import (
     runs_of,
 )
 from tests.runs import (
+    EPISODES,
     HIDDEN_METHOD,
     HIDDEN_REPORTS,
     LIMITS,
     LONGER,
+    REPORTS,
     SEED,
     TUNING,
     UNNAMED_METHOD,
@@ -44,9 +48,8 @@ HELD = json.loads(RESULTS.read_text())
 HIDDEN = {name: run for name, run in HELD.items() if name.startswith("goals-")}
 UNNAMED = {name: run for name, run in HELD.items() if name.startswith(UNNAMED_SUITES)}
 SHIPPED = "ml10-small-seed0"
-ML = {
-    name: run for name, run in HELD.items() if name not in {*HIDDEN, *UNNAMED} and name != SHIPPED
-}
+OLD = {name: run for name, run in HELD.items() if name.startswith(("old-", "before-"))}
+ML10 = {name: run for name, run in HELD.items() if name.startswith("ml10-") and name != SHIPPED}
 
 # RESULTS.json keeps every record as it was written, with the names that were used that day. These
 # have another one today.
@@ -81,8 +84,7 @@ def test_the_tables_are_those_of_the_results():
 
 @pytest.mark.parametrize("report, column, task", [("base", 0, "reach"), ("novel", 1, "lever-pull")])
 def test_a_cell_can_be_recomputed_from_the_episodes(report, column, task):
-    reports = report, f"{report}-goals2"
-    runs = [run[r]["successes"] for run in runs_of(HELD, "ml10-dami") for r in reports]
+    runs = [run[report]["successes"] for run in runs_of(HELD, "ml10-dami") if report in run]
     episodes = "".join(list(columns.values())[column][task] for columns in runs)
     low, high = wilson_interval(episodes.count("1"), len(episodes))
     expected = [100 * x for x in (episodes.count("1") / len(episodes), low, high)]
@@ -106,9 +108,9 @@ def test_a_comparison_counts_what_is_won_and_lost_on_the_same_goals():
     assert rows == [["base", "2", "2", "7", "1.0000"], ["novel", "6", "0", "7", "0.0312"]]
 
 
-def test_runs_are_of_the_variants_that_they_name():
-    for name, run in ML.items():
-        suite, variant, seed = re.fullmatch(r"(ml\d\d-)?(.*)-seed(\d)", name).groups()
+def test_older_runs_are_of_the_variants_that_they_name():
+    for name, run in OLD.items():
+        suite, variant, seed = re.fullmatch(r"(?:old-)?(ml\d\d-)?(.*)-seed(\d)", name).groups()
         variant = variant.removesuffix("-eight").removesuffix("-cpu")
         arguments = with_new_names(run["training"]["arguments"])
         config = run["training"]["config"]
@@ -158,14 +160,14 @@ def test_the_settings_of_a_run_are_those_of_today():
         assert set(config_of(run)) <= {field.name for field in fields(PolicyConfig)}, name
 
 
-def test_every_result_says_how_it_was_measured():
-    for name, run in ML.items():
-        suite = TASKS["ml45" if name.startswith("ml45") else "ml10"]
+def test_every_older_result_says_how_it_was_measured():
+    for name, run in OLD.items():
+        suite = TASKS["ml45" if name.startswith("old-ml45") else "ml10"]
         training = run["training"]
         assert {"command", "hardware", "arguments", "config", "minutes"} <= set(training)
         assert np.isfinite(training["minutes"])
-        shipped = name.startswith("ml10-no-inner-loop-cpu-seed")  # of a file with another config
-        eight = "-eight-" in name or name.startswith(("before", "ml10-inner-3e-2"))
+        shipped = "-no-inner-loop-cpu-seed" in name  # of a file with another configuration
+        eight = "-eight-" in name or name.startswith(("before", "old-ml10-inner-3e-2"))
         for report in (with_new_names(run[part]) for part in run if part != "training"):
             provenance = report["provenance"]
             executed = provenance.get("n_action_steps", training["config"]["n_action_steps"])
@@ -181,7 +183,7 @@ def check_training(name, suite, flags):
     """A run was trained on this suite, with these flags, from the seed in its name."""
     training = HELD[name]["training"]
     arguments, config = training["arguments"], training["config"]
-    for flag, value in vars(parse(flags.split())).items():
+    for flag, value in vars(parse(re.sub(r"--data \S+", "", flags).split())).items():
         if value is not None and flag != "resume":
             assert {**arguments, **config}[flag] == value, (name, flag)
     assert arguments["seed"] == int(name[-1]) and arguments["suite"] == suite
@@ -198,6 +200,10 @@ def test_a_column_is_found_by_its_place_by_its_name_and_by_what_stands_behind_th
     assert measured(run, Column("starts")) is None
 
 
+def test_the_rows_of_readme_are_rows_of_the_tables():
+    assert set(HIDDEN_SUMMARY) <= {title for title, _, _ in HIDDEN_ROWS}
+
+
 def test_a_report_has_the_columns_that_tables_show_of_it():
     shown = [
         (f"goals-{skill}-{variant}", column)
@@ -206,10 +212,15 @@ def test_a_report_has_the_columns_that_tables_show_of_it():
     ]
     shown += [
         (f"pairs-{variant}", Column(report or scene, told, other_task=other_task))
-        for _, variant, report, told in PAIRS_ROWS
+        for _, variant, report, told in UNNAMED_ROWS
         for scene in SCENES
         for other_task in (False, True)
     ]
+    shown += [
+        (f"convention-reach-{variant}", Column(report or "angles", told))
+        for _, variant, report, told in UNNAMED_ROWS
+    ]
+    shown += [(f"goals-reach-{variant}", column) for variant, column in NUMBERS_OF_GOALS.values()]
     found = 0
     for variant, column in shown:
         for run in runs_of(HELD, variant):
@@ -230,6 +241,21 @@ def test_runs_on_tasks_without_a_name_are_those_of_the_queue():
             assert run[part]["provenance"]["seed"] == SEED
             for tasks in run[part]["successes"].values():
                 assert {len(digits) for digits in tasks.values()} == {20}
+
+
+def test_runs_on_ml10_are_those_of_the_queue():
+    for name, run in ML10.items():
+        variant = re.fullmatch(r"ml10-(.+)-seed\d", name)[1]
+        check_training(name, "ml10", VARIANTS[variant])
+        assert run["training"]["arguments"]["steps"] == preset_settings("small", "ml10").steps
+        for part in run:
+            if part == "training":
+                continue
+            assert variant in REPORTS[part][1]
+            assert run[part]["provenance"]["seed"] == SEED
+            for tasks in run[part]["successes"].values():
+                assert list(tasks) == TASKS["ml10"][part]
+                assert {len(digits) for digits in tasks.values()} == {EPISODES}
 
 
 def test_runs_on_hidden_goals_are_those_of_the_queue_and_say_how_they_were_measured():
