@@ -410,7 +410,7 @@ REFUSED = {
     "--data own.npz --checkpoint {run} --task reach": "is a recording of stir, not of reach",
     "--data own.npz --checkpoint {run} --demonstrations 3": "3 demonstrations of stir asked for",
     "--data own.npz --checkpoint {run} --held-out 2": "has 2 episodes",
-    "--data long.npz --checkpoint {run}": "has 11 frames (every 20th), the policy 10 positions",
+    "--data long.npz --checkpoint {run}": "has 11 frames (one in 20), the policy 10 positions",
     "--data wide.npz --checkpoint {run}": "has 7 numbers an action, the policy 4: use",
     "--data none.npz --checkpoint {run}": "holds no episodes",
     "--data nowhere.npz --checkpoint {run}": "is no name",
