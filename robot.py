@@ -1734,7 +1734,7 @@ class Recorder:
         """Does what a key asks for."""
         if key == "g":
             self.closed = 1.0 - self.closed
-            if self.frames:  # the frame before shows nothing of it: an action follows what is seen
+            if self.frames:  # the last one does not show it yet: it is done after that frame
                 self.grip[-1] = self.closed
             servo.check()
             if servo.moves:

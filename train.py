@@ -102,7 +102,7 @@ class Settings:
         None, "windows that begin more than so many frames after success are late", least=0
     )
     late_fraction: float = setting(
-        0.0, "fraction of late windows among those that are drawn; 0: none is", least=0, most=1
+        0.0, "fraction of late windows among those that are drawn; 0: no late ones", least=0, most=1
     )
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
     one_map: bool = setting(

@@ -118,6 +118,7 @@ def sample(policy, batch, seed=0):
         ({"timestep_dim": 31}, ("timestep_dim", "31", "even")),
         ({"tcfm": "left"}, ("left", "mid")),
         ({"tcfm": "up", "unet_widths": (512,)}, ("tcfm", "up", "(512,)")),
+        ({"tcfm": "up", "unet_widths": (512,), "denoiser": "mamba-unet"}, ("tcfm", "up", "(512,)")),
     ],
 )
 def test_a_config_that_contradicts_itself_is_refused_naming_both_values(changes, numbers):
@@ -983,6 +984,15 @@ def test_wrong_inputs_are_refused_with_both_shapes(changes, message):
     given = {name: x and torch.zeros(x) for name, x in changes.items()}
     with pytest.raises(ValueError, match=message):
         policy.loss(**random_batch(policy.config) | given)
+
+
+@pytest.mark.parametrize("tcfm", ["down", "none"])
+@pytest.mark.parametrize("windows, tasks", [(1, 2), (6, 4)])
+def test_windows_that_the_tasks_do_not_divide_are_refused(tcfm, windows, tasks):
+    policy = new_policy(tcfm=tcfm)
+    batch = random_batch(policy.config, windows=windows, tasks=tasks)
+    with pytest.raises(ValueError, match=f"{windows} windows cannot be of {tasks} tasks alike"):
+        policy.loss(**batch)
 
 
 def test_a_policy_that_reads_a_task_does_not_act_without_one():
