@@ -127,7 +127,7 @@ HIDDEN_METHOD = {
     "inner": INNER,
     "inner-first-order": f"{INNER} --maml first",
     "both": "",
-    # The ceiling: in a world of tests.oracle the cloud shows the goal
+    # In a world of tests.oracle: the cloud shows the goal
     "marker": "--maml off --demo-encoder none --data data-marker",
     # Fewer or more goals than the 160 of "demonstration", and as many windows a step, 80
     "demonstration-5-goals": "--maml off --base-tasks 5 --tasks-per-step 5 --support 8 --query 8",
