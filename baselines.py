@@ -74,7 +74,7 @@ class FlowPolicy(DP3Policy):
     end s of t's segment ([0, 1/2] or [1/2, 1]):
 
         f_t = x_t + (s - t) v(x_t)      f_r = x_r + (s - r) v(x_r)
-        loss = (|f_t - f_r|^2 + 1e-5 |v(x_t) - v(x_r)|^2) / 0.01^2, the second where r < s
+        loss = (|f_t - f_r|^2 + 1e-5 |v(x_t) - v(x_r)|^2) / 0.01^2, the second term only where r < s
 
     As t comes to s, f_t comes to x_s whatever v is: that alone ties the network to the data.
 

@@ -51,9 +51,15 @@ def flag_name(name: str) -> str:
 
 
 def check_settings(settings: Any) -> None:
-    """Raises UserError if a number of a settings dataclass is outside its bounds, or not finite."""
+    """Raises UserError for a value of a settings dataclass that is no choice or out of bounds.
+
+    A number that is not finite is out of bounds.
+    """
     for f in fields(settings):
         value = getattr(settings, f.name)
+        choices = f.metadata.get("choices")
+        if choices and value not in choices:
+            raise UserError(f"{flag_name(f.name)} is {value!r}: use one of {', '.join(choices)}")
         if not isinstance(value, (int, float)):
             continue
         least, most = f.metadata.get("least", -math.inf), f.metadata.get("most", math.inf)

@@ -148,7 +148,7 @@ class Demonstrations:
     def part(self, first: int, stop: int) -> "Demonstrations":
         """Returns the episodes from `first` up to, but without, `stop` (views, no copies).
 
-        At least one, of those that there are.
+        The range holds at least one episode, and only episodes that exist.
         """
         start, end = self.episode(first).start, self.episode(stop - 1).stop
         meta = dict(self.meta)

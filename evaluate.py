@@ -23,6 +23,7 @@ import argparse
 import copy
 import json
 import math
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -35,7 +36,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.func import functional_call
 
 import baselines  # noqa: F401  (adds its policies to those that can be loaded)
 import common
@@ -113,11 +113,6 @@ DEMONSTRATION_CONTROLS = {
 # ---- The inner step, as adaptation ---------------------------------------------------------------
 
 
-def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
-    """The loss () of a policy with these parameters in place of its own, as maml.py takes it."""
-    return functional_call(policy, params, (), batch)
-
-
 def rate_of_checkpoint(
     info: dict[str, Any], device: str | torch.device, override: float | None = None
 ) -> maml.InnerRate:
@@ -176,7 +171,7 @@ def take_inner_steps(
         support.update(DEMONSTRATION_CONTROLS[demonstration_control](demonstration))
     support = {name: x.to(text.device) for name, x in support.items()}
 
-    loss_fn = partial(loss_of, policy)
+    loss_fn = partial(model.loss_of, policy)
     params = {name: p.detach() for name, p in policy.named_parameters()}
     for step in range(1, steps + 1):
         params = maml.adapt(loss_fn, params, support, lr)
@@ -311,7 +306,7 @@ def take_actions(
     seen, successes = [], []
     for i, action in enumerate(chunk):
         _, truncated, info = environment.advance(action)
-        successes.append(info["success"])
+        successes.append(bool(info["success"]))
         if truncated or (stop_at_success and info["success"]):
             return seen, successes, True
         if i >= len(chunk) - n_observations:
@@ -449,6 +444,7 @@ class PolicyOfTask:
     inner_steps: int
     inner_lr: float | None
     support: int | None
+    inner_seed: int  # of the windows and the noise of inner steps
 
 
 def adaptation_sampler(
@@ -491,6 +487,7 @@ def keep_policy_of_task(wanted: PolicyOfTask) -> tuple[DAMIPolicy, WindowSampler
             steps=wanted.inner_steps,
             batch=wanted.support or info["arguments"]["support"],
             lr=rate_of_checkpoint(info, wanted.device, wanted.inner_lr),
+            seed=wanted.inner_seed,
             demonstration_control=wanted.demonstration_control,
         )
         for _, _, adapted in of_each_step:
@@ -527,8 +524,9 @@ def evaluate_checkpoint(
         recordings: task -> file with its demonstrations.
         text: task -> instruction feature, (text_dim,).
         episodes: rollouts of each task; episode i has the goal of `evaluation_seed(seed, i)`.
-        seed: chooses goals, noise and reference demonstrations; with `known_goals` neither goals
-            nor noise.
+        seed: chooses goals, noise, reference demonstrations, and what inner steps are taken on.
+            With `known_goals` it chooses the last of these, and, where all rollouts of a task hold
+            one demonstration, which.
         workers: processes; None: one a core.
         device: where the policy runs.
         n_demonstrations: use only the first so many of each recording; None: all.
@@ -567,6 +565,7 @@ def evaluate_checkpoint(
             inner_steps=inner_steps,
             inner_lr=inner_lr,
             support=support,
+            inner_seed=zlib.crc32(f"{seed} {task}".encode()),  # each task has draws of its own
         )
         for start in range(0, len(seeds), episodes_a_job):
             jobs.append(
@@ -622,10 +621,11 @@ def rollout_job(
 ) -> tuple[list[list[bool]], list[list[bool]]]:
     """`rollout` of the episodes of these seeds, of one task, in a worker process.
 
-    With a `reference_seed` the demonstration that it draws is held by all rollouts of the task.
+    A `reference_seed` draws one demonstration, which all rollouts of the task hold.
 
-    Returns for each episode whether each step was a success, and the same of the pair's other task
-    where tasks are pairs, see unnamed_tasks.py; elsewhere no episode.
+    Returns two lists with an entry for each episode: whether each of its steps was a success, and
+    whether each of them did the other task of a pair. The second list is empty where tasks are no
+    pairs, see unnamed_tasks.py.
     """
     policy, sampler, text = keep_policy_of_task(wanted)
     environments = environments_of(simulator, task, len(seeds), policy.config.num_points)
@@ -955,7 +955,7 @@ def add_inference_flags(parser: Any) -> None:
         "--sampler", choices=("ddim", "dp3"), help="DDIM as published, or as DP3 runs it"
     )
     parser.add_argument("--n-action-steps", type=int, help="actions until the policy looks again")
-    parser.add_argument("--inference-steps", type=int, help="of the diffusion for each chunk")
+    parser.add_argument("--inference-steps", type=int, help="diffusion steps for each chunk")
 
 
 def inference_overrides(args: argparse.Namespace) -> dict[str, Any]:
@@ -973,7 +973,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("--checkpoint", nargs="+", help="files or run folders (default: the newest run's last)")
     add("--suite", help="such as ml10, ml45 (default: the checkpoint's, or ml10)")
-    add("--split", choices=("base", "novel", "all"), default="base", help="which of its tasks")
+    add("--split", choices=("base", "novel", "all"), default="base", help="of the suite's tasks")
     add("--task", nargs="+", help="only these tasks, of the suite's simulator")
     add("--data", default="data", help="folder of the demonstrations (default: data)")
     add(
@@ -982,16 +982,16 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         help="demonstrations a task (default: 10 or 5, as the suite says)",
     )
     add("--episodes", type=int, default=20, help="episodes a task (default: 20)")
-    add("--top", type=int, default=0, help="all checkpoints of a run, and the mean of the best TOP")
+    add("--top", type=int, default=0, help="all checkpoints, and the mean of the best TOP")
     inputs = ("demonstration", "instruction")
     add(
         "--swap",
         nargs="+",
         choices=inputs,
         default=[],
-        help="measure the last checkpoint also with that of another task",
+        help="measure the last checkpoint also with another task's demonstration or instruction",
     )
-    add("--without", nargs="+", choices=inputs, default=[], help="zeros in the place of these")
+    add("--without", nargs="+", choices=inputs, default=[], help="give zeros in place of these")
     add(
         "--controls",
         nargs="+",
@@ -1003,7 +1003,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add(
         "--known-goals",
         action="store_true",
-        help="those of the demonstrations, with noise that does not depend on --seed",
+        help="roll out on the goals of the demonstrations; noise then does not depend on --seed",
     )
     add(
         "--stop-at-success",

@@ -224,130 +224,140 @@ def log_heldout_error(
     return error
 
 
-def checkpoint_after(folder: Path, step: int) -> Path:
-    """The checkpoint of an intermediate step."""
-    return folder / f"adapted-{step:05d}.pt"
+@dataclass(frozen=True)
+class Adaptation:
+    """The adaptation of a checkpoint's policy to one task: from which files to which, and how."""
 
+    checkpoint: Path  # a file of train.py or finetune.py
+    recording: Path  # a file with the task's demonstrations
+    folder: Path  # what is written goes there
+    settings: Settings
+    curve: Sequence[int]  # after so many steps each, a checkpoint is written and rolled out as well
+    config_overrides: dict[str, Any]  # of the policy's configuration, see `inference_overrides`
 
-def adapt_checkpoint(
-    checkpoint: Path,
-    recording: Path,
-    text: Tensor,
-    folder: Path,
-    settings: Settings,
-    *,
-    curve: Sequence[int],
-    config_overrides: dict[str, Any],
-) -> float:
-    """Adapts the policy of a checkpoint to the task of a recording, on the device of `text`.
+    def describe(self) -> dict[str, Any]:
+        """What config.json says beside the seconds: all that decides the results."""
+        return {
+            "checkpoint": str(self.checkpoint),
+            "data": str(self.recording),
+            "curve": list(self.curve),
+            "config_overrides": self.config_overrides,
+            **asdict(self.settings),
+        }
 
-    Writes adapted.pt, a checkpoint like any other, metrics.jsonl and config.json to `folder`, and
-    held-out.md if there are held-out episodes.
+    def checkpoint_after(self, step: int) -> Path:
+        """The checkpoint of an intermediate step."""
+        return self.folder / f"adapted-{step:05d}.pt"
 
-    Args:
-        checkpoint: a file of train.py or finetune.py.
-        recording: a file with the task's demonstrations.
-        text: instruction feature, (text_dim,).
-        folder: it exists.
-        settings: how to adapt.
-        curve: after so many steps each, adapted-STEP.pt is written as well.
-        config_overrides: of the policy's configuration, see `evaluate.inference_overrides`.
+    def run(self, text: Tensor) -> float:
+        """Adapts the policy, on the device of the instruction feature `text` (text_dim,).
 
-    Returns:
-        The seconds that the gradient steps took.
+        Writes adapted.pt, a checkpoint like any other, metrics.jsonl and config.json to the folder,
+        which exists, and held-out.md if there are held-out episodes.
 
-    Raises:
-        RecordingError, CheckpointError: one of the two files is damaged, or they do not fit.
-        UserError: the loss is not finite.
-    """
-    policy, info = evaluate.load_trained(checkpoint, text.device, **config_overrides)
-    demonstrations = load_demonstrations(recording).take(settings.demonstrations)
-    kept, heldout = hold_out(demonstrations, settings.held_out)
-    sampler = evaluate.adaptation_sampler(kept, policy, info)
-    write_text(folder / "metrics.jsonl", "")  # lines are appended
-    if heldout is not None:
-        heldout_sampler = WindowSampler(heldout, policy.config)
-        before = log_heldout_error(folder, 0, policy, sampler, heldout_sampler, text)
-    if settings.normalizer == "fit":
-        policy.normalizer.fit([sampler])  # line 3
+        Returns the seconds that the gradient steps took.
 
-    checkpoint_info = {
-        **{name: info[name] for name in evaluate.TRAINED},
-        "inner_rates": info.get("inner_rates", {}),
-        "adaptation": asdict(settings),
-        "adapted_to": demonstrations.task,
-        "instruction": demonstrations.instruction,
-    }
-    if settings.inner_steps is None:
-        training = adapt_policy(
-            policy,
-            sampler,
-            text,
-            steps=settings.steps,
-            batch=settings.batch,
-            learning_rates={part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES},
-            seed=settings.seed,
-        )
-    else:
-        training = evaluate.take_inner_steps(
-            policy,
-            sampler,
-            text,
-            steps=settings.inner_steps,
-            batch=settings.batch,
-            lr=evaluate.rate_of_checkpoint(info, text.device, settings.inner_lr),
-            seed=settings.seed,
-        )
-    seconds = 0.0
-    began = time.monotonic()
-    with common.progress_bar(
-        desc=f"adapting to {demonstrations.task}", unit="step", total=settings.steps
-    ) as bar:
-        for step, loss, adapted in training:
-            seconds += time.monotonic() - began
-            bar.set_postfix(loss=f"{loss:.4f}")
-            bar.update()
-            append_json(folder / "metrics.jsonl", step=step, loss=loss)
-            if step in curve:
-                model.save(checkpoint_after(folder, step), adapted, **checkpoint_info)
-            began = time.monotonic()
-    model.save(folder / "adapted.pt", adapted, **checkpoint_info)
+        Raises:
+            RecordingError, CheckpointError: one of the two files is damaged, or they do not fit.
+            UserError: the loss is not finite.
+        """
+        settings, folder = self.settings, self.folder
+        policy, info = evaluate.load_trained(self.checkpoint, text.device, **self.config_overrides)
+        demonstrations = load_demonstrations(self.recording).take(settings.demonstrations)
+        kept, heldout = hold_out(demonstrations, settings.held_out)
+        sampler = evaluate.adaptation_sampler(kept, policy, info)
+        write_text(folder / "metrics.jsonl", "")  # lines are appended
+        if heldout is not None:
+            heldout_sampler = WindowSampler(heldout, policy.config)
+            before = log_heldout_error(folder, 0, policy, sampler, heldout_sampler, text)
+        if settings.normalizer == "fit":
+            policy.normalizer.fit([sampler])  # line 3
 
-    if heldout is not None:
-        after = log_heldout_error(folder, settings.steps, adapted, sampler, heldout_sampler, text)
-        table = report.action_error_table(
-            {
-                "the mean action": before.of_mean_action,
-                "step 0": before.of_policy,
-                f"step {settings.steps}": after.of_policy,
-            },
-            sampler.action_names,
-        )
-        print(table, flush=True)
-        write_text(folder / "held-out.md", f"{table}\n\n{report.HELDOUT_NOTE}\n")
-    description = describe_adaptation(
-        checkpoint, recording, settings, curve=curve, config_overrides=config_overrides
-    )
-    write_text(folder / "config.json", json.dumps({**description, "seconds": seconds}, indent=1))
-    return seconds
+        checkpoint_info = {
+            **{name: info[name] for name in evaluate.TRAINED},
+            "inner_rates": info.get("inner_rates", {}),
+            "adaptation": asdict(settings),
+            "adapted_to": demonstrations.task,
+            "instruction": demonstrations.instruction,
+        }
+        if settings.inner_steps is None:
+            training = adapt_policy(
+                policy,
+                sampler,
+                text,
+                steps=settings.steps,
+                batch=settings.batch,
+                learning_rates={part: getattr(settings, f"lr_{part}") for part in LEARNING_RATES},
+                seed=settings.seed,
+            )
+        else:
+            training = evaluate.take_inner_steps(
+                policy,
+                sampler,
+                text,
+                steps=settings.inner_steps,
+                batch=settings.batch,
+                lr=evaluate.rate_of_checkpoint(info, text.device, settings.inner_lr),
+                seed=settings.seed,
+            )
+        seconds = 0.0
+        began = time.monotonic()
+        with common.progress_bar(
+            desc=f"adapting to {demonstrations.task}", unit="step", total=settings.steps
+        ) as bar:
+            for step, loss, adapted in training:
+                seconds += time.monotonic() - began
+                bar.set_postfix(loss=f"{loss:.4f}")
+                bar.update()
+                append_json(folder / "metrics.jsonl", step=step, loss=loss)
+                if step in self.curve:
+                    model.save(self.checkpoint_after(step), adapted, **checkpoint_info)
+                began = time.monotonic()
+        model.save(folder / "adapted.pt", adapted, **checkpoint_info)
 
+        if heldout is not None:
+            after = log_heldout_error(
+                folder, settings.steps, adapted, sampler, heldout_sampler, text
+            )
+            table = report.action_error_table(
+                {
+                    "the mean action": before.of_mean_action,
+                    "step 0": before.of_policy,
+                    f"step {settings.steps}": after.of_policy,
+                },
+                sampler.action_names,
+            )
+            print(table, flush=True)
+            write_text(folder / "held-out.md", f"{table}\n\n{report.HELDOUT_NOTE}\n")
+        description = {**self.describe(), "seconds": seconds}
+        write_text(folder / "config.json", json.dumps(description, indent=1))
+        return seconds
 
-def describe_adaptation(
-    checkpoint: Path,
-    recording: Path,
-    settings: Settings,
-    *,
-    curve: Sequence[int],
-    config_overrides: dict[str, Any],
-) -> dict[str, Any]:
-    """What config.json says of an adaptation, beside its seconds: all that decides its results."""
-    return {
-        "checkpoint": str(checkpoint),
-        "data": str(recording),
-        "curve": list(curve),
-        "config_overrides": config_overrides,
-        **asdict(settings),
-    }
+    def roll_out(
+        self, task: str, text: Tensor, simulator: Simulator, pool: WorkerPool
+    ) -> dict[str, Outcomes]:
+        """Rolls out the policy before and after `run`, and in between: column -> outcomes."""
+        columns = {"before": self.checkpoint}
+        for step in sorted(set(self.curve)):
+            columns[f"{step} steps"] = self.checkpoint_after(step)
+        columns["after"] = self.folder / "adapted.pt"
+        taken = len(load_demonstrations(self.recording).take(self.settings.demonstrations))
+        return {
+            column: evaluate.evaluate_checkpoint(
+                checkpoint=policy,
+                simulator=simulator,
+                recordings={task: self.recording},
+                text={task: text},
+                episodes=self.settings.episodes,
+                seed=self.settings.seed,
+                device=text.device,
+                n_demonstrations=taken - self.settings.held_out,
+                config_overrides=self.config_overrides,
+                description=f"evaluating {column}",
+                pool=pool,
+            )
+            for column, policy in columns.items()
+        }
 
 
 def read_instructions(
@@ -426,7 +436,7 @@ def choose_tasks(names: Sequence[str], simulator: Simulator, suite: str) -> list
         if not novel:
             raise UserError(f"--task novel: {suite} has no novel tasks")
         return novel
-    return [check_task(simulator, name) for name in names]
+    return [check_task(simulator, name) for name in dict.fromkeys(names)]  # each once
 
 
 def check_recording(
@@ -460,28 +470,21 @@ def claim_folders(folders: Iterable[Path], checkpoint: Path, overwrite: bool) ->
 
 
 def read_measured(
-    checkpoint: Path,
-    paths: dict[str, Path],
-    folders: dict[str, Path],
-    settings: Settings,
-    *,
-    curve: Sequence[int],
-    config_overrides: dict[str, Any],
+    adaptations: dict[str, Adaptation],
 ) -> dict[str, tuple[dict[str, Outcomes], float]]:
     """What an interrupted run has measured: task -> (column -> outcomes, seconds of adapting).
 
-    Arguments as of `adapt_tasks`. Raises UserError for a task that was adapted to or rolled out in
-    another way than these say.
+    Raises UserError for a task that was adapted to or rolled out in another way than `adaptations`
+    (task -> how) say.
     """
     measured = {}
-    for task, folder in folders.items():
+    for task, adaptation in adaptations.items():
+        folder = adaptation.folder
         if not (folder / "success.json").is_file() or not (folder / "config.json").is_file():
             continue
         config = json.loads((folder / "config.json").read_text())
         seconds = config.pop("seconds")
-        expected = describe_adaptation(
-            checkpoint, paths[task], settings, curve=curve, config_overrides=config_overrides
-        )
+        expected = adaptation.describe()
         changed = [name for name, value in expected.items() if config.get(name) != value]
         if changed:
             raise UserError(
@@ -493,14 +496,9 @@ def read_measured(
 
 
 def adapt_tasks(
-    checkpoint: Path,
-    paths: dict[str, Path],
+    adaptations: dict[str, Adaptation],
     text: dict[str, Tensor],
-    folders: dict[str, Path],
-    settings: Settings,
     *,
-    curve: Sequence[int],
-    config_overrides: dict[str, Any],
     simulator: Simulator | None,
     workers: int | None,
     provenance: dict[str, Any],
@@ -511,9 +509,7 @@ def adapt_tasks(
     What is measured of a task is written into its folder at once.
 
     Args:
-        checkpoint: the policy.
-        paths, text, folders: task -> its recording, instruction feature and folder to write to.
-        settings, curve, config_overrides: see `adapt_checkpoint`.
+        adaptations, text: task -> how, and its instruction feature (text_dim,).
         simulator: to roll out in; None: there is none.
         workers: processes for the rollouts; None: one a core.
         provenance: what stands beside the results.
@@ -526,79 +522,24 @@ def adapt_tasks(
     results: dict[str, Outcomes] = {}  # column -> those of all tasks
     total_seconds = 0.0
     with WorkerPool(workers) as pool:
-        for task, folder in folders.items():
+        for task, adaptation in adaptations.items():
+            folder = adaptation.folder
             if task in measured:
                 of_task, seconds = measured[task]
                 print(f"{task} was measured before: {folder}", flush=True)
             else:
-                seconds = adapt_checkpoint(
-                    checkpoint,
-                    paths[task],
-                    text[task],
-                    folder,
-                    settings,
-                    curve=curve,
-                    config_overrides=config_overrides,
-                )
+                seconds = adaptation.run(text[task])
                 written = folder / "adapted.pt"
                 print(f"adapted to {task} in {seconds:.1f} s; wrote {written}", flush=True)
                 of_task = {}
-                if simulator is not None and settings.episodes > 0:
-                    of_task = roll_out_before_and_after(
-                        task,
-                        checkpoint,
-                        paths[task],
-                        text[task],
-                        folder,
-                        settings,
-                        curve=curve,
-                        config_overrides=config_overrides,
-                        simulator=simulator,
-                        pool=pool,
-                    )
+                if simulator is not None and adaptation.settings.episodes > 0:
+                    of_task = adaptation.roll_out(task, text[task], simulator, pool)
                     report.write_report(folder, of_task, {**provenance, "title": task})
             total_seconds += seconds
             for column, outcomes in of_task.items():
                 earlier = results.get(column, Outcomes({}, {}))
                 results[column] = earlier.joined(outcomes)
     return results, total_seconds
-
-
-def roll_out_before_and_after(
-    task: str,
-    checkpoint: Path,
-    recording: Path,
-    text: Tensor,
-    folder: Path,
-    settings: Settings,
-    *,
-    curve: Sequence[int],
-    config_overrides: dict[str, Any],
-    simulator: Simulator,
-    pool: WorkerPool,
-) -> dict[str, Outcomes]:
-    """Rolls out a policy and what `adapt_checkpoint` made of it: column -> outcomes."""
-    columns = {"before": checkpoint}
-    for step in sorted(set(curve)):
-        columns[f"{step} steps"] = checkpoint_after(folder, step)
-    columns["after"] = folder / "adapted.pt"
-    taken = len(load_demonstrations(recording).take(settings.demonstrations))
-    return {
-        column: evaluate.evaluate_checkpoint(
-            checkpoint=policy,
-            simulator=simulator,
-            recordings={task: recording},
-            text={task: text},
-            episodes=settings.episodes,
-            seed=settings.seed,
-            device=text.device,
-            n_demonstrations=taken - settings.held_out,
-            config_overrides=config_overrides,
-            description=f"evaluating {column}",
-            pool=pool,
-        )
-        for column, policy in columns.items()
-    }
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -637,7 +578,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         tasks = [recording.task]
 
     # Results of one task stand in the folder itself, those of several in a folder each
-    name = "-".join(args.task or tasks)
+    name = "novel" if args.task == ["novel"] else "-".join(tasks)
     out = Path(args.out or f"runs/finetune/{name}-seed{settings.seed}")
     several = len(tasks) > 1 or args.task == ["novel"]
     if args.resume and not several:
@@ -649,16 +590,18 @@ def main(argv: Sequence[str] | None = None) -> None:
             paths = {task: Path(args.data) / f"{task}.npz" for task in tasks}
         else:
             paths = {recording.task: file}
-        measured = {}
-        if args.resume:
-            measured = read_measured(
-                checkpoint,
-                paths,
-                folders,
-                settings,
+        adaptations = {
+            task: Adaptation(
+                checkpoint=checkpoint,
+                recording=paths[task],
+                folder=folders[task],
+                settings=settings,
                 curve=args.curve,
                 config_overrides=config_overrides,
             )
+            for task in tasks
+        }
+        measured = read_measured(adaptations) if args.resume else {}
         unfinished = [folder for task, folder in folders.items() if task not in measured]
         old_files = claim_folders({out, *unfinished}, checkpoint, args.overwrite or args.resume)
         if recording is None:
@@ -691,13 +634,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         }
         try:
             results, seconds = adapt_tasks(
-                checkpoint,
-                paths,
+                adaptations,
                 text,
-                folders,
-                settings,
-                curve=args.curve,
-                config_overrides=config_overrides,
                 simulator=simulator,
                 workers=args.workers,
                 provenance=provenance,

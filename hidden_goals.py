@@ -33,9 +33,9 @@ from metaworld_env import INSTRUCTIONS, RECIPE, RENDER_PIXELS, MetaWorldPointClo
 # ---- Goals and starts ----------------------------------------------------------------------------
 
 SKILLS = ("reach", "push", "pick-place")
-# The goals of each skill: to train on, to choose by, and to measure on. Tasks are called after
-# them: reach-goal-07, reach-validation-07, reach-novel-07.
-GOALS = {"goal": 320, "validation": 10, "novel": 20}
+# How many goals of each kind a skill has: to train on, to choose by, and to measure on. Tasks are
+# called after them: reach-goal-07, reach-validation-07, reach-novel-07.
+NUM_GOALS = {"goal": 320, "validation": 10, "novel": 20}
 
 # Where goals lie: in this box, and so far from the middle of where objects begin, horizontally.
 # Objects begin at most hypot(0.05, 0.03) = 0.058 from there: every goal is at least 0.21 - 0.058 =
@@ -72,8 +72,8 @@ def split_name(task: str) -> tuple[str, str, int]:
 
 
 def names_of(skill: str, kind: str) -> list[str]:
-    """Returns the tasks of a skill that are of one kind, a key of GOALS."""
-    return [f"{skill}-{kind}-{number:02d}" for number in range(GOALS[kind])]
+    """Returns the tasks of a skill that are of one kind, a key of NUM_GOALS."""
+    return [f"{skill}-{kind}-{number:02d}" for number in range(NUM_GOALS[kind])]
 
 
 def goal_of(task: str) -> np.ndarray:
@@ -179,7 +179,7 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
 def all_tasks() -> Iterator[str]:
     """The tasks of all skills, in the order that decides the seeds of demonstrations."""
     for skill in SKILLS:
-        for kind in GOALS:
+        for kind in NUM_GOALS:
             yield from names_of(skill, kind)
 
 

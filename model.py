@@ -35,6 +35,7 @@ from typing import Any, ClassVar, Protocol
 import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
+from torch.func import functional_call
 from torch.optim.swa_utils import AveragedModel
 
 # ---- Configuration -------------------------------------------------------------------------------
@@ -155,7 +156,7 @@ class PolicyConfig:
 
     @property
     def reads_task(self) -> bool:
-        """Whether anything names the task. Without, the network is DP3's."""
+        """Whether the policy reads an instruction or a demonstration; without, it is DP3's."""
         return self.demo_encoder != "none" or self.tcfm != "none"
 
 
@@ -379,7 +380,7 @@ class PooledTask(nn.Module):
 
 
 def sinusoids(timesteps: Tensor, dim: int) -> Tensor:
-    """(...) int64 -> (..., dim): sines, then cosines, of geometrically falling rates."""
+    """(...) of any dtype -> (..., dim): sines, then cosines, of geometrically falling rates."""
     half = dim // 2
     exponents = torch.arange(half, device=timesteps.device) * (-math.log(10000) / (half - 1))
     angles = timesteps[..., None] * exponents.exp()  # (..., dim / 2)
@@ -405,7 +406,7 @@ class ConditionEncoder(nn.Module):
         self.condition_mlp = condition_mlp if config.reads_task else nn.Identity()
 
     def forward(self, timesteps: Tensor, observation: Tensor) -> Tensor:
-        """timesteps (B,) int64, observation (B, To * feature) -> h_k (B, C)."""
+        """timesteps (B,), observation (B, To * feature) -> h_k (B, C)."""
         embedding = sinusoids(timesteps, self.timestep_dim)  # (B, timestep_dim)
         embedding = self.timestep_mlp(embedding.to(observation.dtype))
         return self.condition_mlp(torch.cat([embedding, observation], dim=-1))
@@ -669,7 +670,7 @@ class DAMIPolicy(nn.Module):
 
     @property
     def reads_demonstration(self) -> bool:
-        """Whether a demonstration does; it is not enough that an instruction does."""
+        """Whether the policy reads a demonstration."""
         return self.config.demo_encoder != "none"
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -731,7 +732,7 @@ class DAMIPolicy(nn.Module):
     def denoise(
         self, noisy: Tensor, timesteps: Tensor, observation: Tensor, context: Context
     ) -> Tensor:
-        """A_k (B, H, A), k (B,) int64, observation (B, To * feature) -> predicted A_0 (B, H, A)."""
+        """A_k (B, H, A), k (B,), observation (B, To * feature) -> predicted A_0 (B, H, A)."""
         h = self.condition_encoder(timesteps, observation)  # (B, C)   Eq. 7
         if context is None:
             return self.denoiser(noisy, h)
@@ -886,6 +887,11 @@ def ema_model(policy: DAMIPolicy) -> AveragedModel:
     average = AveragedModel(policy, multi_avg_fn=update)
     average.module.eval()
     return average
+
+
+def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
+    """The loss () of a policy with these parameters in place of its own, as maml.py takes it."""
+    return functional_call(policy, params, (), batch)
 
 
 # ---- What a configuration names, and presets -----------------------------------------------------

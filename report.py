@@ -105,7 +105,8 @@ def paper_columns(suite: str, policies: Iterable[str]) -> PaperColumns:
         policies: keys of PAPER_NAMES; others, which the paper does not have, are skipped.
 
     Returns:
-        "paper, DAMI" -> task -> success rate in percent, for base and novel tasks.
+        "paper, DAMI" -> task -> success rate in percent, for base and novel tasks. The policies
+        that are no DAMI were trained without MAML there.
     """
     tables = json.loads(PAPER_RESULTS.read_text()).get(suite)
     if tables is None:

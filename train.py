@@ -99,10 +99,10 @@ class Settings:
     vectorize: int = setting(1, "tasks that run at once; memory grows with them", least=1)
     bfloat16: bool = setting(False, "compute steps without an inner step in bfloat16")
     after_success: int | None = setting(
-        None, "windows that begin more than so many frames after success are late", least=0
+        None, "a window that begins more than so many frames after success is late", least=0
     )
     late_fraction: float = setting(
-        0.0, "fraction of late windows among those that are drawn; 0: no late ones", least=0, most=1
+        0.0, "fraction of late windows in a batch; 0 leaves them out", least=0, most=1
     )
     augment: bool = setting(False, "shift, turn and stretch each scene at random")
     one_map: bool = setting(
@@ -240,8 +240,8 @@ def task_batch(
 ) -> dict[str, Tensor]:
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
-    The first windows are the support set, and where there are episodes enough they are of others
-    than the query windows.
+    The first `settings.support` windows are the support set. With three or more episodes, support
+    and query windows come from different ones.
 
     Where the instruction names the task, a policy need read nothing else. In a fraction of the
     batches (`instruction_dropout`) zeros therefore take its place, and only the demonstration tells
@@ -317,7 +317,7 @@ def maml_gradient(
     """
     inner_lr = rate_in_training(log_rates, settings)
     gradients, rate_gradients, losses = meta_gradient(
-        partial(evaluate.loss_of, policy),
+        partial(model.loss_of, policy),
         dict(policy.named_parameters()),
         [split(batch, settings.support) for batch in batches],
         lr=inner_lr,
@@ -330,7 +330,7 @@ def maml_gradient(
 
 
 def tasks_of_step(step: int, tasks: int, settings: Settings) -> list[int]:
-    """The tasks of an outer step, by their places: all, or as many as the settings say."""
+    """The numbers of an outer step's tasks: all, or as many as the settings say."""
     if settings.tasks_per_step is None or settings.tasks_per_step >= tasks:
         return list(range(tasks))
     rng = np.random.default_rng((settings.seed, step))
@@ -428,10 +428,10 @@ def meta_train(
 
     for step in range(state.step, settings.steps):  # lines 2, 22
         inner = step >= settings.pretrain_steps
-        places = tasks_of_step(step, len(all_tasks), settings)
-        my_places = places[rank::world]
+        task_numbers = tasks_of_step(step, len(all_tasks), settings)
+        my_task_numbers = task_numbers[rank::world]
         batches = []
-        for i in my_places:  # lines 3 to 6, 9
+        for i in my_task_numbers:  # lines 3 to 6, 9
             task = all_tasks[i]
             batch = task_batch(
                 policy,
@@ -460,7 +460,7 @@ def meta_train(
         # The mean over all tasks: that of the processes' means, weighted by their numbers of tasks
         if world > 1:
             for x in (*figures.values(), *gradients.values(), *log_rate_gradients.values()):
-                dist.all_reduce(x.mul_(len(my_places) / len(places)))
+                dist.all_reduce(x.mul_(len(my_task_numbers) / len(task_numbers)))
 
         if state.log_rates:
             figures["inner_lr"] = torch.stack(list(state.log_rates.values())).mean().exp()
@@ -609,7 +609,7 @@ def fingerprint(samplers: dict[str, WindowSampler]) -> str:
             sha.update(f"{sampler.positions_in_state} {sampler.center.tolist()}".encode())
             if sampler.rotation_near is not None:
                 sha.update(f"{sampler.rotation_near.tolist()}".encode())
-        for part in (sampler.points, sampler.state, sampler.action, sampler.windows):
+        for part in (sampler.points, sampler.state, sampler.action, sampler.windows, sampler.late):
             sha.update(part.cpu().numpy().tobytes())
     return sha.hexdigest()
 
@@ -630,20 +630,25 @@ class Evaluation:
     workers: int | None
     device: torch.device
 
-    def roll_out(self, checkpoint: Path, **options: Any) -> Outcomes:
-        """Rolls a checkpoint out; `options` are those of `evaluate.evaluate_checkpoint`."""
-        arguments = {
-            "checkpoint": checkpoint,
-            "simulator": self.simulator,
-            "recordings": self.recordings,
-            "text": {task: self.text[task] for task in self.recordings},
-            "episodes": self.settings.episodes,
-            "seed": evaluate.EVALUATION_SEED,
-            "workers": self.workers,
-            "device": self.device,
-            "n_demonstrations": self.n_demonstrations,
-        }
-        return evaluate.evaluate_checkpoint(**(arguments | options))
+    def roll_out(
+        self, checkpoint: Path, recordings: dict[str, Path] | None = None, **options: Any
+    ) -> Outcomes:
+        """Rolls a checkpoint out, with the demonstrations of `recordings` or of the tasks' own.
+
+        `options` are further ones of `evaluate.evaluate_checkpoint`.
+        """
+        return evaluate.evaluate_checkpoint(
+            checkpoint=checkpoint,
+            simulator=self.simulator,
+            recordings=recordings or self.recordings,
+            text={task: self.text[task] for task in self.recordings},
+            episodes=self.settings.episodes,
+            seed=evaluate.EVALUATION_SEED,
+            workers=self.workers,
+            device=self.device,
+            n_demonstrations=self.n_demonstrations,
+            **options,
+        )
 
     def run(self, step: int, stop: StopRequest) -> Outcomes | None:
         """Rolls out the checkpoint of a step and logs the outcomes, or reads them from the log.
@@ -691,8 +696,9 @@ class Evaluation:
         checkpoint = self.folder / f"ema-{settings.steps:05d}.pt"
         own_title = "own demonstration" if reads_demonstration else "no demonstration"
         others: dict[str, dict[str, Any]] = {}
-        if reads_demonstration:
+        if reads_demonstration and len(self.recordings) > 1:
             others["another task's"] = {"recordings": evaluate.of_next_task(self.recordings)}
+        if reads_demonstration:
             others["none"] = {"demonstration_control": "zeros"}
         columns = {own_title: own}
         try:
@@ -893,7 +899,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
             choices=choices.get(name),
             help="see model.PolicyConfig" + common.describe_presets(values),
         )
-    group = parser.add_argument_group("settings (default: the preset's)")
+    group = parser.add_argument_group(
+        "settings", "Default: the preset's. Suites whose tasks no observation names change some."
+    )
     common.add_settings(group, Settings, SETTINGS)
     return parser.parse_args(argv)
 
@@ -1149,6 +1157,7 @@ def run(
         began = time.monotonic()
         for figures in meta_train(state, train_samplers, text, settings, rank=rank, world=world):
             state.seconds += time.monotonic() - began
+            milestone = is_milestone(state.step, settings)
             if rank == 0:
                 bar.update()
                 bar.set_postfix(loss=f"{figures['loss']:.4f}")
@@ -1158,7 +1167,6 @@ def run(
                     **figures,
                     seconds=round(state.seconds, 2),
                 )
-                milestone = is_milestone(state.step, settings)
                 if milestone:  # before last.pt: a run that goes on from there lacks none of it
                     save_average(folder, state, checkpoint_info)
                     if heldout_samplers:
@@ -1166,9 +1174,10 @@ def run(
                             folder, state, train_samplers, heldout_samplers, text, settings
                         )
                     report.plot_curves(folder)
-                if milestone or stop.requested or saver.is_due():
-                    saver.save(state)
-            if stop.requested:
+            stopping = stop.requested  # read once: a signal from now on is served a step later
+            if rank == 0 and (milestone or stopping or saver.is_due()):
+                saver.save(state)
+            if stopping:
                 raise KeyboardInterrupt(f"saved after step {state.step}, add --resume to go on")
             if rank == 0:
                 outcomes = evaluation.run(state.step, stop)
@@ -1219,21 +1228,11 @@ def main(argv: Sequence[str] | None = None) -> None:
             print(f"preset {name} on {where}, {tasks}, in {folder}", flush=True)
             check_folder(folder, args.resume)
             if simulator is not None:
-                collect(
-                    simulator,
-                    list(paths),
-                    data,
-                    episodes=settings.demonstrations,
-                    workers=args.workers,
-                )
+                n = settings.demonstrations
+                collect(simulator, list(paths), data, episodes=n, workers=args.workers)
                 if novel_paths:
-                    collect(
-                        simulator,
-                        list(novel_paths),
-                        data,
-                        episodes=simulator.demonstrations,
-                        workers=args.workers,
-                    )
+                    n = simulator.demonstrations
+                    collect(simulator, list(novel_paths), data, episodes=n, workers=args.workers)
         if world > 1:
             dist.barrier()
         run(

@@ -45,13 +45,12 @@ from evaluate import (
     checkpoints_of,
     instruction_features,
     load_trained,
-    loss_of,
     rollout,
 )
 from finetune import BATCH, LEARNING_RATES, adapt_policy
 from maml import adapt, meta_gradient
 from metaworld_env import MetaWorld
-from model import PRESETS, CheckpointError, DAMIPolicy, PolicyConfig, split
+from model import PRESETS, CheckpointError, DAMIPolicy, PolicyConfig, loss_of, split
 from simulator import collect, demonstration_seed, evaluation_seed, record_episode
 from tests.textbook import TextbookDP3, training_step
 from train import SETTINGS, Settings, multi_task_gradient, task_batch

@@ -11,13 +11,15 @@ simulators of their own, whose recordings fit no other one; but a checkpoint doe
 world it was trained.
 `augmented-twice`: scenes are turned and stretched up to twice as much in training.
 `not-averaged`: what is kept are the weights themselves, in place of their moving average.
+`frozen`: as soon as steps have an inner step, weights stay as they are, and only the learning rates
+of the inner step are trained (`train.py --learn-inner-lr`).
 """
 
 import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import ClassVar
 
@@ -125,12 +127,27 @@ def not_averaged() -> None:
     train.ema_model = lambda policy: AveragedModel(policy, avg_fn=lambda mean, last, n: last)
 
 
+def frozen() -> None:
+    """Training without an inner step ends as if it were all; then only inner rates are learned."""
+    schedule = train.learning_rate
+
+    def learning_rate(step: int, settings: train.Settings, peak: float) -> float:
+        if peak == settings.rate_lr:
+            return peak
+        if step >= settings.pretrain_steps:
+            return 0.0
+        return schedule(step, replace(settings, steps=settings.pretrain_steps), peak)
+
+    train.learning_rate = learning_rate
+
+
 WORLDS = {
     "positions": positions,
     "pixels": pixels,
     "marker": marker,
     "augmented-twice": augmented_twice,
     "not-averaged": not_averaged,
+    "frozen": frozen,
 }
 
 

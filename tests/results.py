@@ -4,6 +4,7 @@
     python -m tests.results                        # writes the tables, draws the charts
     python -m tests.results --compare ml10-dami ml10-neither    # episodes won and lost, sign test
     python -m tests.results --ship RUN             # makes it assets/SUITE-small.pt, float16
+    python -m tests.results --ship RUN goals-reach-inner    # the same with another name
 
 RESULTS.json holds for each run how it was trained and, for each report that measured it, every
 episode (1: success, 0: not) with the command, hardware, seed and date.
@@ -180,7 +181,8 @@ def take(results: Results, run: Path) -> None:
         "minutes": round(steps[-1]["seconds"] / 60, 1),
         **json.loads((run / "config.json").read_text()),
     }
-    inner_steps = [line for line in steps if "loss_before" in line][-500:]
+    late = [line for line in steps if line["step"] > steps[-1]["step"] - 500]
+    inner_steps = [line for line in late if "loss_before" in line]
     if inner_steps:  # the mean query losses of the last 500 outer steps
         training["inner_step"] = {
             "before": round(float(np.mean([line["loss_before"] for line in inner_steps])), 5),
@@ -529,8 +531,14 @@ HIDDEN_ROWS = (
     ("second order: before any step", "inner", Column("0-steps")),
     ("second order: 1 inner step", "inner", Column("1-steps")),
     ("second order: 1 inner step on another goal", "inner", Column("1-steps-swap", SHOWN_ANOTHER)),
+    ("second order: 1 inner step, from one demonstration", "inner", Column("1-steps-of-1")),
+    ("second order: 1 inner step, from two", "inner", Column("1-steps-of-2")),
     ("second order: 5 inner steps", "inner", Column("5-steps")),
     ("second order: 20 inner steps", "inner", Column("20-steps")),
+    ("second order: 1 step of AdamW", "inner", Column("adamw", "1 steps")),
+    ("second order: 5 steps of AdamW", "inner", Column("adamw", "5 steps")),
+    ("second order: 20 steps of AdamW", "inner", Column("adamw", "20 steps")),
+    ("second order: 200 steps of AdamW", "inner", Column("adamw", "after")),
     ("first order: before any step", "inner-first-order", Column("0-steps")),
     ("first order: 1 inner step", "inner-first-order", Column("1-steps")),
     ("first order: 5 inner steps", "inner-first-order", Column("5-steps")),
@@ -539,6 +547,14 @@ HIDDEN_ROWS = (
     ("multi-task: 1 step at its best rate", "neither", Column("1-steps-best-rate")),
     ("multi-task: 5 steps at their best rate", "neither", Column("5-steps-best-rate")),
     ("multi-task: 20 steps at their best rate", "neither", Column("20-steps-best-rate")),
+    ("multi-task: 1 step of AdamW", "neither", Column("adamw", "1 steps")),
+    ("multi-task: 5 steps of AdamW", "neither", Column("adamw", "5 steps")),
+    ("multi-task: 20 steps of AdamW", "neither", Column("adamw", "20 steps")),
+    ("multi-task: 200 steps of AdamW", "neither", Column("adamw", "after")),
+    ("multi-task, then learned rates: before any step", "frozen", Column("0-steps")),
+    ("multi-task, then learned rates: 1 step", "frozen", Column("1-steps")),
+    ("multi-task, then learned rates: 5 steps", "frozen", Column("5-steps")),
+    ("multi-task, then learned rates: 20 steps", "frozen", Column("20-steps")),
     ("multi-task, longer: before any step", "neither-as-long", Column("0-steps")),
     ("multi-task, longer: 1 step", "neither-as-long", Column("1-steps-best-rate")),
     ("multi-task, longer: 5 steps", "neither-as-long", Column("5-steps-best-rate")),
@@ -787,45 +803,64 @@ def plot_adaptation(results: Results, path: Path) -> None:
     save_png(figure, path, dpi=120)
 
 
-INNER_STEPS = (0, 1, 5, 20)
 ARMS = {  # of those without a demonstration encoder -> its line in the figure
     "inner": "second-order MAML",
     "inner-first-order": "first-order MAML",
-    "neither": "multi-task, as many outer steps, at its best rates",
-    "neither-as-long": "multi-task, as many minutes, at its best rates",
+    "frozen": "multi-task, then learned rates",
+    "neither": "multi-task",
 }
 
 
-def plot_inner_steps(results: Results, skill: str, path: Path) -> None:
-    """Writes a chart of success at the end on novel goals along inner steps, a line an arm.
+def columns_of_steps(arm: str) -> dict[str, dict[int, Column]]:
+    """The panels of the figure: a title -> after so many steps -> where that was measured.
+
+    Multi-task training has, for each number of inner steps, the rate that is best for it.
+    """
+    best_rate = "-best-rate" if arm == "neither" else ""
+    inner_steps = {n: Column(f"{n}-steps{best_rate}") for n in (1, 5, 20)}
+    adamw = {n: Column("adamw", f"{n} steps") for n in (1, 5, 20)}
+    return {
+        "inner steps, on eight windows": {0: Column("0-steps"), **inner_steps},
+        "steps of AdamW, on 64 windows each": {
+            0: Column("adamw", "before"),
+            **adamw,
+            200: Column("adamw", "after"),
+        },
+    }
+
+
+def plot_steps(results: Results, skill: str, path: Path) -> None:
+    """Writes a chart of success at the end on novel goals along gradient steps, a line an arm.
 
     Lines are means of trainings, each of which is a dot. A dashed line is the mean of the policies
     that read a demonstration, without any step.
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6.5, 3.6), layout="constrained")
-    axes = figure.subplots()
+    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
     for place, (arm, label) in enumerate(ARMS.items()):
         variant, color = f"goals-{skill}-{arm}", f"C{place}"
-        x = np.arange(len(INNER_STEPS)) + 0.05 * (place - 1.5)  # so that no arm hides another
-        means = []
-        for i, n in enumerate(INNER_STEPS):
-            report = f"{n}-steps-best-rate" if arm.startswith("neither") and n else f"{n}-steps"
-            rates = of_each_run(results, variant, Column(report, at_end=True))
-            axes.plot([x[i]] * len(rates), rates, "o", color=color, alpha=0.5)
-            means.append(np.mean(rates) if rates else np.nan)
-        if not np.isnan(means).all():
-            axes.plot(x, means, color=color, label=label)
+        for axes, columns in zip(panels, columns_of_steps(arm).values()):
+            x = np.arange(len(columns)) + 0.05 * (place - 1.5)  # so that no arm hides another
+            means = []
+            for i, column in enumerate(columns.values()):
+                rates = of_each_run(results, variant, replace(column, at_end=True))
+                axes.plot([x[i]] * len(rates), rates, "o", color=color, alpha=0.5)
+                means.append(np.mean(rates) if rates else np.nan)
+            if not np.isnan(means).all():
+                axes.plot(x, means, color=color, label=label)
     shown = of_each_run(results, f"goals-{skill}-demonstration", Column("novel", 0, at_end=True))
-    if shown:
-        label = "with a demonstration as input, no step"
-        axes.axhline(np.mean(shown), color="gray", linestyle="--", label=label)
-    axes.set_xticks(range(len(INNER_STEPS)), [str(n) for n in INNER_STEPS])
-    axes.set(xlabel="steps of gradient descent on eight windows of the new goal", ylim=(-3, 103))
-    axes.set_ylabel(f"success at the end, {skill}, %")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8, loc="center right")
+    for axes, (title, columns) in zip(panels, columns_of_steps("inner").items()):
+        if shown:
+            label = "with a demonstration as input, no step"
+            axes.axhline(np.mean(shown), color="gray", linestyle="--", label=label)
+        axes.set_xticks(range(len(columns)), [str(n) for n in columns])
+        axes.set(xlabel=title, ylim=(-3, 103))
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel(f"success at the end, {skill}, %")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, ncols=3, loc="outside upper center", frameon=False, fontsize=8)
     save_png(figure, path, dpi=120)
 
 
@@ -880,15 +915,18 @@ def compare(results: Results, one: str, other: str) -> str:
     return format_table(rows)
 
 
-def ship(run: str) -> None:
-    """Writes assets/SUITE-small.pt: the last checkpoint, in float16, rolled out as `small` is."""
+def ship(run: str, name: str | None = None) -> None:
+    """Writes a run's last checkpoint to assets/NAME.pt, in float16, to be rolled out as `small` is.
+
+    Without a name it is SUITE-small, which scripts take where there is no run of the suite.
+    """
     small = model.PRESETS["small"]
     checkpoint = checkpoints_of(run)[-1]
     policy, info = load_trained(
         checkpoint, n_action_steps=small.n_action_steps, inference_steps=small.inference_steps
     )
     kept = {name: info[name] for name in (*TRAINED, "inner_rates") if name in info}
-    path = SHIPPED_CHECKPOINT.with_name(f"{info['suite']}-small.pt")  # where scripts look for it
+    path = SHIPPED_CHECKPOINT.with_name(f"{name or info['suite'] + '-small'}.pt")
     model.save(path, policy, half=True, **kept)
 
 
@@ -897,14 +935,16 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("runs", nargs="*", help="folders of tests.runs to take into RESULTS.json")
     add("--compare", nargs=2, metavar="VARIANT", help="episodes that the first wins and loses")
-    add("--ship", metavar="RUN", help="make its last checkpoint assets/SUITE-small.pt")
+    add("--ship", nargs="+", metavar="RUN", help="a run, and a name: assets/NAME.pt is made of it")
     return parser.parse_args(argv)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(argv)
     if args.ship:
-        ship(args.ship)
+        if len(args.ship) > 2:
+            raise UserError("--ship takes a run and a name")
+        ship(*args.ship)
         return
     results = json.loads(RESULTS.read_text())
     if args.compare:
@@ -922,7 +962,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         write_text(path, text)
     plot_swap(results, ROOT / "assets" / "swap.png")
     plot_by_task(results, ROOT / "assets" / "success.png")
-    plot_inner_steps(results, "reach", ROOT / "assets" / "inner-steps.png")
+    plot_steps(results, "reach", ROOT / "assets" / "inner-steps.png")
     if any("curve" in run for run in results.values()):
         plot_adaptation(results, ROOT / "assets" / "adaptation.png")
 

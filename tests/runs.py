@@ -127,7 +127,9 @@ HIDDEN_METHOD = {
     "inner": INNER,
     "inner-first-order": f"{INNER} --maml first",
     "both": "",
-    # In a world of tests.oracle: the cloud shows the goal
+    # In worlds of tests.oracle: rates of the inner step are learned for the weights of "neither",
+    # after its 1,500 steps; and the cloud shows the goal
+    "frozen": INNER.replace("--pretrain-fraction 0.2", "--pretrain-fraction 0.75 --steps 2000"),
     "marker": "--maml off --demo-encoder none --data data-marker",
     # Fewer or more goals than the 160 of "demonstration", and as many windows a step, 80
     "demonstration-5-goals": "--maml off --base-tasks 5 --tasks-per-step 5 --support 8 --query 8",
@@ -139,7 +141,7 @@ HIDDEN_METHOD = {
     "demonstration-320-goals": "--maml off --base-tasks 320",
 }
 NUMBERS_OF_GOALS = tuple(f"demonstration-{n}-goals" for n in (5, 20, 40, 80, 320))
-ADAPTED = ("inner", "inner-first-order")
+ADAPTED = ("inner", "inner-first-order", "frozen")
 MULTI_TASK = ("neither", "neither-as-long")
 READERS = ("demonstration", "demonstration-twice-the-rate")
 # Multi-task training has no rate of an inner step. For each number of steps it gets the one that
@@ -159,13 +161,15 @@ def hidden_reports() -> dict[str, tuple[str, Sequence[str]]]:
         "parts": (f"{novel} --controls last-frame no-actions shuffled", READERS),
         "0-steps": (novel, (*ADAPTED, *MULTI_TASK, *NUMBERS_OF_GOALS, "marker")),
         "1-steps-swap": (f"{novel} --inner-steps 1 --swap demonstration", ("inner",)),
+        "1-steps-of-1": (f"{novel} --inner-steps 1 --demonstrations 1", ("inner",)),
+        "1-steps-of-2": (f"{novel} --inner-steps 1 --demonstrations 2", ("inner",)),
     }
     for steps, rate in MULTI_TASK_RATES.items():
         adapted = f"{novel} --inner-steps {steps}"
         reports[f"{steps}-steps"] = (adapted, (*ADAPTED, "both"))
         reports[f"{steps}-steps-best-rate"] = (f"{adapted} --inner-lr {rate}", MULTI_TASK)
     by_adamw = "finetune.py --task novel --checkpoint {run} --curve 1 5 20"
-    arms = (*READERS, "both", *ADAPTED, *MULTI_TASK)
+    arms = (*READERS, "both", "inner", "inner-first-order", *MULTI_TASK)
     reports["adamw"] = (by_adamw, arms)  # the last, since it takes longest
     return reports
 

@@ -358,6 +358,8 @@ def dataset(path, version="v3.0", seen="observation.point_cloud", shape=(30, 3),
     else:
         lines = [json.dumps({"task_index": i, "task": task}) for i, task in enumerate(instructions)]
         (path / "meta/tasks.jsonl").write_text("\n".join(lines))
+        lines = [json.dumps({"episode_index": e, "length": n}) for e, n in enumerate(LENGTHS)]
+        (path / "meta/episodes.jsonl").write_text("\n".join(lines))
         files = {f"episode_{e:06d}": episode == e for e in range(3)}
     for name, rows in files.items():
         table = {}
@@ -381,7 +383,7 @@ def rewrite(path, rows=None, **changes):
     write_table(columns, path)
 
 
-@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
 def test_a_dataset_becomes_a_recording_a_task(version, capsys):
     values = dataset("kitchen", version)
     convert.main("--import kitchen --num-points 16 --out own".split())
@@ -399,6 +401,13 @@ def test_a_dataset_becomes_a_recording_a_task(version, capsys):
         np.testing.assert_array_equal(found.action, values["action"][rows])
         cloud = {tuple(p) for p in np.float16(values["observation.point_cloud"][rows][-1])}
         assert found.points.shape[1:] == (16, 3) and {tuple(p) for p in found.points[-1]} <= cloud
+
+
+def test_an_episode_of_an_older_dataset_must_be_as_long_as_it_says(capsys):
+    dataset("kitchen", "v2.1")
+    rewrite("kitchen/data/chunk-000/episode_000002.parquet", rows=range(5))
+    message = fails(convert, "--import kitchen --num-points 16 --out own".split(), capsys)
+    assert "episode 2 should have 7 frames, but has 5" in message
 
 
 LENS = [40.0, 50.0, 8.0, 6.0]

@@ -815,9 +815,14 @@ def test_affine_maps_keep_to_their_limits_about_the_middle(monkeypatch):
     a, b = data.sample_affine_maps(1000, middle, seeded())
     shift = (middle @ a.mT + b)[:, 0] - middle
     assert (shift.abs() <= torch.tensor(data.SHIFT) + 1e-6).all()
-    assert (shift.abs().amax(0) > 0.04).all()
-    change = torch.linalg.matrix_norm(a - torch.eye(3), ord=2)
-    assert (change < 3 * data.STRETCH + 2 * data.TURN).all()
+    assert (shift.abs().amax(0) > 0.9 * torch.tensor(data.SHIFT)).all()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(data, "TURN", 0.0)
+        a, _ = data.sample_affine_maps(1000, middle, seeded())
+        stretch = a - torch.eye(3)  # (1000, 3, 3), only changes of length are left
+        assert stretch.abs().max() <= data.STRETCH + 1e-6
+        assert stretch.amax() > 0.9 * data.STRETCH and stretch.amin() < -0.9 * data.STRETCH
 
     monkeypatch.setattr(data, "STRETCH", 0.0)
     a, _ = data.sample_affine_maps(1000, middle, seeded())

@@ -7,6 +7,7 @@ import json
 import runpy
 import sys
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
@@ -14,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
-from conftest import fails
+from conftest import fails, same_bits
 from toy_simulator import COLORS, ToySimulator
 
 import clip
@@ -273,6 +274,77 @@ def test_in_worker_processes_the_episodes_are_the_same(run, recordings, monkeypa
     assert "evaluating: 100%" in capsys.readouterr().err
 
 
+def test_inner_steps_of_each_task_and_seed_have_draws_of_their_own(run, recordings, monkeypatch):
+    seeds = []
+
+    def steps(policy, *_, seed, **__):
+        seeds.append(seed)
+        return [(1, 0.0, policy)]
+
+    monkeypatch.setattr(evaluate, "take_inner_steps", steps)
+    base = {task: recordings[task] for task in TASKS}
+    arguments = run / "ema-00006.pt", ToySimulator(), base, dict.fromkeys(TASKS, torch.zeros(512))
+    for seed in (0, 1, 0):
+        options = {"inner_steps": 1, "inner_lr": 0.1, "support": 4}
+        evaluate.evaluate_checkpoint(*arguments, episodes=1, seed=seed, **options)
+        evaluate.keep_policy_of_task.cache_clear()
+    assert len(set(seeds)) == 4 and seeds[:2] == seeds[4:]
+
+
+def test_adaptation_has_late_windows_as_training_had_them(trained):
+    recording = replace(numbered([40, 40]), meta={"success_frames": [10, 10]})
+    recording = replace(recording, state=recording.state[:, :3], action=recording.action[:, :3])
+    info = {"arguments": {"after_success": 5, "late_fraction": 0.25}}
+    sampler = evaluate.adaptation_sampler(recording, trained, info)
+    assert sampler.late.any() and sampler.late_fraction == 0.25 and not sampler.augment
+
+
+def policy_of_task(checkpoint, recording):
+    """What a worker process is asked for, of two demonstrations and without inner steps."""
+    return evaluate.PolicyOfTask(
+        checkpoint=checkpoint,
+        device="cpu",
+        config_overrides=(),
+        recording=recording,
+        n_demonstrations=2,
+        text=np.zeros(512, np.float32).tobytes(),
+        demonstration_control=None,
+        inner_steps=0,
+        inner_lr=0.1,
+        support=4,
+        inner_seed=0,
+    )
+
+
+def test_what_a_process_keeps_is_not_mistaken_for_something_else(run, recordings):
+    wanted = policy_of_task(run / "ema-00006.pt", recordings["touch-red"])
+
+    def weights_for(**changes):
+        policy, _, _ = evaluate.keep_policy_of_task(replace(wanted, **changes))
+        return dict(policy.named_parameters())
+
+    _, sampler, text = evaluate.keep_policy_of_task(wanted)
+    _, fewer, _ = evaluate.keep_policy_of_task(replace(wanted, n_demonstrations=1))
+    assert (len(sampler.episodes), len(fewer.episodes)) == (2, 1)
+    ones = np.ones(512, np.float32).tobytes()
+    _, _, other_text = evaluate.keep_policy_of_task(replace(wanted, text=ones))
+    assert not text.any() and other_text.all()
+
+    kept = [
+        weights_for(),
+        weights_for(inner_steps=1),
+        weights_for(inner_steps=2),
+        weights_for(inner_steps=1, inner_lr=0.01),
+        weights_for(inner_steps=1, support=8),
+        weights_for(inner_steps=1, inner_seed=1),
+        weights_for(inner_steps=1, demonstration_control="zeros"),
+        weights_for(checkpoint=run / "ema-00003.pt"),
+    ]
+    for one, other in combinations(kept, 2):
+        assert not same_bits(one, other)
+    assert same_bits(kept[1], weights_for(inner_steps=1))
+
+
 def test_ten_episodes_are_rolled_out_side_by_side(run, recordings, monkeypatch):
     """Part of the protocol of every published number: the noise drawn depends on it."""
     calls = []
@@ -392,20 +464,8 @@ def test_a_job_sees_the_same_frames_whatever_its_worker_did_before(run, recordin
 
     def job(task, episode):
         frames.clear()
-        wanted = evaluate.PolicyOfTask(
-            checkpoint=run / "ema-00003.pt",
-            device="cpu",
-            config_overrides=(),
-            recording=recordings[task],
-            n_demonstrations=2,
-            text=np.zeros(512, np.float32).tobytes(),
-            demonstration_control=None,
-            inner_steps=0,
-            inner_lr=None,
-            support=None,
-        )
         evaluate.rollout_job(
-            wanted,
+            policy_of_task(run / "ema-00003.pt", recordings[task]),
             simulator=Watched(),
             task=task,
             seeds=[simulator.evaluation_seed(0, episode)],
@@ -530,6 +590,35 @@ def walk(monkeypatch, corridor, config=model.PRESETS["tiny"], **options):
         policy, [corridor], [5], sampler, torch.zeros(512), torch.Generator(), **options
     )
     return successes, demonstrations, states
+
+
+class Walked(Corridor):
+    """Remembers the first number of each action that it was told."""
+
+    def begin(self, seed):
+        super().begin(seed)
+        self.told = []
+
+    def advance(self, action):
+        self.told.append(round(float(action[0])))
+        return super().advance(action)
+
+
+def test_each_rollout_takes_the_actions_of_its_own_chunks_in_their_order(monkeypatch):
+    policy = model.DAMIPolicy(model.PRESETS["tiny"])
+
+    def sample(points, state, context, generator):
+        """Actions that tell the corridor and the step: 100 * length + step, numbered on."""
+        length, step = state[:, -1, 0, None, None], state[:, -1, 1, None, None]
+        return (100 * length + step + torch.arange(8)[:, None]).expand(-1, 8, 4)
+
+    monkeypatch.setattr(policy, "encode_demo", lambda text, **demo: None)
+    monkeypatch.setattr(policy, "sample_actions", sample)
+    sampler = data.WindowSampler(numbered([40]), policy.config)
+    corridors = [Walked(n) for n in (20, 5, 13)]  # the second ends first
+    evaluate.rollout(policy, corridors, range(3), sampler, torch.zeros(512), torch.Generator())
+    for corridor in corridors:
+        assert corridor.told == [100 * corridor.length + t for t in range(corridor.length)]
 
 
 def test_a_rollout_says_of_each_step_whether_it_was_a_success(monkeypatch):

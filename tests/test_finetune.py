@@ -326,15 +326,15 @@ def test_an_interrupted_run_of_several_tasks_goes_on_with_those_that_are_left(
 ):
     evaluated(monkeypatch, lambda checkpoint: [checkpoint.stem == "adapted"])
     argv = [*adapting(run, recorded, "--episodes 1", task="door-close reach"), "--out", "both"]
-    adapt_checkpoint = finetune.adapt_checkpoint
+    adapt_to_task = finetune.Adaptation.run
 
-    def interrupted(checkpoint, recording, *args, **options):
-        if recording.stem == "reach":
+    def interrupted(adaptation, text):
+        if adaptation.recording.stem == "reach":
             raise KeyboardInterrupt
-        return adapt_checkpoint(checkpoint, recording, *args, **options)
+        return adapt_to_task(adaptation, text)
 
     with monkeypatch.context() as patch:
-        patch.setattr(finetune, "adapt_checkpoint", interrupted)
+        patch.setattr(finetune.Adaptation, "run", interrupted)
         with pytest.raises(KeyboardInterrupt, match="add --resume to go on"):
             finetune.main(argv)
     finished = fingerprint(Path("both/door-close"))
@@ -386,6 +386,12 @@ def test_held_out_episodes_tell_what_adaptation_bought(run, capsys):
     assert re.search(head, printed) and re.search(head, table)
     for title, line in (("step 0", before), ("step 2", after)):
         assert re.search(rf"\| {title} .*\| {line['action_error']:.4f} +\|", table)
+
+    # The first episode alone was adapted to
+    options = ["--checkpoint", str(run), *"--demonstrations 1 --steps 2 --out first".split()]
+    finetune.main(["--data", "stir.npz", *options])
+    with_held_out, first = (dict(weights(f"{name}/adapted.pt")[0]) for name in ("adapted", "first"))
+    assert same_bits(with_held_out, first)
 
 
 # ---- Bad input -----------------------------------------------------------------------------------

@@ -174,23 +174,21 @@ def test_the_cloud_lacks_the_marker_and_nothing_else(environments):
     assert missing == {*map(tuple, whole[of_marker].tolist())}
 
 
-def test_nothing_is_learned_of_goals_from_first_observations(environments):
-    """The best linear map, on goals that it was not fitted to, is no better than their mean."""
-    for skill, (env, _) in environments.items():
-        seen, goals = [], []
-        for i, task in enumerate(tasks_of(skill)[::6]):
-            env.goal = goal_of(task)
-            env.begin(demonstration_seed(SIMULATOR, task, 0, 0) if i % 2 else evaluation_seed(1, i))
-            observation = env.observe()
-            cloud = observation["point_cloud"]
-            seen.append([*cloud.mean(0), *cloud.max(0), *observation["agent_pos"][:3], 1.0])
-            goals.append(env.goal)
-        seen, goals = np.array(seen), np.array(goals)
-        half = len(goals) // 2
-        weights, *_ = np.linalg.lstsq(seen[:half], goals[:half], rcond=1e-6)
-        error = np.square(seen[half:] @ weights - goals[half:])[:, :2].mean()
-        of_mean = np.square(goals[:half].mean(axis=0) - goals[half:])[:, :2].mean()
-        assert error > 0.9 * of_mean, skill
+def test_nothing_is_learned_of_goals_from_where_an_episode_begins():
+    """The best linear map, on goals that it was not fitted to, is no better than their mean.
+
+    Where object and hand begin is all that differs between first observations, see above.
+    """
+    for skill in SKILLS:
+        tasks = tasks_of(skill)
+        goals = np.array([goal_of(task)[:2] for task in tasks for _ in range(5)])
+        seeds = [demonstration_seed(SIMULATOR, task, 0, i) for task in tasks for i in range(5)]
+        starts = np.array([[*np.concatenate(start_of(seed)), 1.0] for seed in seeds])
+        half = 5 * (len(tasks) // 2)
+        weights, *_ = np.linalg.lstsq(starts[:half], goals[:half])
+        error = np.square(starts[half:] @ weights - goals[half:]).mean()
+        of_mean = np.square(goals[:half].mean(axis=0) - goals[half:]).mean()
+        assert len(goals) == 5 * 350 and error > 0.97 * of_mean, skill
 
 
 @pytest.mark.parametrize("skill", SKILLS)

@@ -1,6 +1,7 @@
 """Tests of rl.py: its gradients against finite differences, and that it learns."""
 
 import json
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -157,7 +158,15 @@ def test_a_step_into_nothing_is_no_error_but_is_not_taken(adapted):
     for name, value in (("log_std", -1e4), ("mean.4.bias", float("nan"))):
         candidate = {**params, name: torch.full_like(params[name], value)}
         loss, kl = policies.surrogate_loss_and_kl(candidate, old)
-        assert not (np.isfinite(loss) and kl <= 0.02)
+        assert not (loss < 0 and kl <= 0.02)  # what the line search asks for
+
+
+def test_where_no_step_is_good_enough_nothing_is_changed(adapted):
+    policies, params, support, query = adapted
+    settings = replace(POINT, inner_lr=policies.inner_lr, max_kl=0.0)  # no step keeps to that
+    assert rl.trpo_step(policies.policy, support, query, settings) == (0.0, POINT.backtracks)
+    for name, p in policies.policy.named_parameters():
+        assert torch.equal(p, params[name])
 
 
 # ---- Advantages ----------------------------------------------------------------------------------
@@ -179,6 +188,31 @@ def test_what_the_state_and_the_time_foretell_is_no_advantage():
     assert np.corrcoef(batch["advantages"], surprise.reshape(-1))[0, 1] > 0.95
     assert batch["advantages"].mean().abs() < 1e-5
     assert batch["advantages"].std() == pytest.approx(1, abs=0.01)
+
+
+def test_advantages_are_those_of_generalized_advantage_estimation():
+    rng = np.random.default_rng(0)
+    shape, discount, gae_lambda = (4, 9), 0.9, 0.7
+    rollouts = Rollouts(
+        states=rng.normal(size=(*shape, 3)),
+        actions=rng.normal(size=(*shape, 2)),
+        rewards=rng.normal(size=shape),
+        successes=np.zeros(shape, bool),
+    )
+    settings = replace(POINT, discount=discount, gae_lambda=gae_lambda)
+    batch = rl.to_batch(rollouts, settings)
+
+    values = rl.baseline_values(rollouts, rl.discounted_sums(rollouts.rewards, discount))
+    next_values = np.pad(values[:, 1:], ((0, 0), (0, 1)))
+    deltas = rollouts.rewards + discount * next_values - values
+    advantages = np.array(
+        [
+            [sum((discount * gae_lambda) ** k * d for k, d in enumerate(of[t:])) for t in range(9)]
+            for of in deltas
+        ]
+    ).ravel()
+    expected = (advantages - advantages.mean()) / advantages.std()
+    np.testing.assert_allclose(batch["advantages"], expected, atol=1e-5)
 
 
 # ---- It learns -----------------------------------------------------------------------------------
@@ -209,6 +243,30 @@ def test_it_learns_to_find_a_goal_that_only_rewards_tell():
     assert after > before + 3  # of 10 steps, whose rewards are the distances, negative
     assert after > untrained_after + 3
     assert untrained_after < untrained_before + 2
+
+
+def test_each_iteration_has_goals_of_its_own_and_none_is_measured_on(monkeypatch):
+    policy, trained_on, measured_on = GaussianPolicy(2, 2, 8), [], []
+
+    class Watched(InProcessPool):
+        def run(self, job, jobs, bar=None):
+            trained_on.extend(arguments["goal"] for arguments in jobs)
+            return super().run(job, jobs, bar)
+
+    def run_jobs(job, jobs, **_):
+        measured_on.extend(arguments["goal"] for arguments in jobs)
+        return InProcessPool().run(job, jobs)
+
+    monkeypatch.setattr(rl, "run_jobs", run_jobs)
+    monkeypatch.setattr(rl, "trpo_step", lambda *_, **__: (0.0, 0))
+    simulator = PointSimulator()
+    for iteration in range(3):
+        rl.iterate(Watched(), simulator, ["a", "b", "c"], policy, iteration, POINT, bar=None)
+    rl.measure(simulator, ["a"], policy, POINT, workers=None)
+    assert len({goal.seed for goal in trained_on}) == 3 * POINT.goals
+    assert len({goal.noise_seed for goal in trained_on}) == 3 * POINT.goals
+    assert sorted(Counter(goal.task for goal in trained_on[: POINT.goals]).values()) == [1, 2, 2]
+    assert not {goal.seed for goal in trained_on} & {goal.seed for goal in measured_on}
 
 
 # ---- Command line --------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import ctypes
-import functools
 import json
 import math
 import os
@@ -23,6 +22,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from conftest import load_once
 from scipy.spatial.transform import Rotation, Slerp
 
 import clip
@@ -828,10 +828,13 @@ def test_a_program_that_does_not_end_is_told(emulator, settings, capsys):
     assert "does not end: stop it by hand" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_no_script_of_faults_makes_the_arm_faster_than_allowed(seed):
-    fastest, limits, _ = fuzz_robot(seed)
-    assert fastest[0] <= limits[0] and fastest[1] <= limits[1]
+def test_no_script_of_faults_makes_the_arm_faster_than_allowed():
+    moved = 0
+    for seed in range(4):
+        fastest, limits, _ = fuzz_robot(seed)
+        assert fastest[0] <= limits[0] and fastest[1] <= limits[1]
+        moved += max(fastest) > 0
+    assert moved >= 2  # an arm that does not move is never too fast
 
 
 def test_inference_does_not_hold_up_the_stream(emulator, settings):
@@ -1553,14 +1556,10 @@ def trained(tmp_path_factory):
 @pytest.fixture
 def running(cell, trained, monkeypatch):
     """Arguments of `run`, with a checkpoint and demonstrations."""
-    cached = functools.cache(clip.load_clip_text_encoder)
-    monkeypatch.setattr(clip, "load_clip_text_encoder", TEXT.setdefault("encoder", cached))
+    monkeypatch.setattr(clip, "load_clip_text_encoder", load_once)
     for name in ("policy.pt", "demos.npz"):
         shutil.copy(trained / name, name)
     return ["run", *cell, *RUN]
-
-
-TEXT = {}
 
 
 def the_log():
@@ -1585,12 +1584,28 @@ def test_running_moves_the_arm_within_its_limits_and_ends_with_a_stop(
     log = the_log()
     assert log.meta["ended"] == "done" and log.meta["made_by"] == "robot.run"
     assert len(log.state) == len(log.meta["commanded"]) == len(log.meta["points_seen"]) >= 16
-    done = np.array(log.meta["commanded"])
-    for before, after, action in zip(done, done[1:], log.action):
-        if np.linalg.norm(action[:3]) < 0.005:  # not cut short
-            np.testing.assert_allclose(after[:3] - before[:3], action[:3], atol=4e-3)
     policy, _ = model.load("policy.pt")
     assert len(data.WindowSampler(log, policy.config)) > 0
+
+
+def test_a_policy_sees_the_last_two_frames_and_the_arm_does_what_it_draws(running, monkeypatch):
+    seen, rng = [], np.random.default_rng(0)
+
+    def sample(policy, points, state, context, generator):
+        seen.append(state[0].numpy())
+        chunk = rng.choice([-1, 1], (1, 8, 7)) * [*[0.004] * 3, *[0.001] * 3, 0.0]
+        return torch.tensor(chunk, dtype=torch.float32)
+
+    monkeypatch.setattr(model.DAMIPolicy, "sample_actions", sample)
+    assert ends([*running, "--seconds", "1"]) == 0
+    log = the_log()
+    assert len(seen) > 1
+    for older, newest in seen:
+        [frame, *_] = np.flatnonzero((log.state == newest).all(axis=1))
+        np.testing.assert_array_equal(older, log.state[max(frame - 1, 0)])
+    moved = np.diff(np.array(log.meta["commanded"])[:, :3], axis=0)
+    drawn = log.action[: len(moved), :3]
+    assert np.corrcoef(moved.ravel(), drawn.ravel())[0, 1] > 0.6
 
 
 def test_the_first_frames_are_seen_after_the_gripper_is_ready(emulator, settings, running):
@@ -1635,6 +1650,16 @@ def test_a_recorded_episode_is_replayed_from_where_it_began(emulator, settings, 
         expected = robot.compose(expected, action)
     np.testing.assert_allclose(emulator.pose, expected, atol=4e-3)
     assert_within_limits(emulator, settings)
+
+    # The gripper was told each new position, 1000 for open, that is a hundredth away at least.
+    moves = [frame for frame in emulator.gripper_frames if frame[1:4] == b"\x06\x01\x03"]
+    positions = []
+    for closed in recorded.action[:, 6].tolist():
+        position = round((1 - closed) * 1000)
+        if not positions or abs(position - positions[-1]) >= 10:
+            positions.append(position)
+    assert [int.from_bytes(frame[4:6], "big") for frame in moves] == positions
+
     assert ends([*argv, "--episode", "7"]) == 2 and "no --episode 7" in capsys.readouterr().err
     data.save_demonstrations("flat.npz", replace(recorded, action=recorded.action[:, :4]))
     assert ends(["replay", *running[1:-4], "--data", "flat.npz"]) == 2

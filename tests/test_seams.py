@@ -211,25 +211,33 @@ def test_training_where_no_observation_tells_the_task_ends_with_what_tells_it(
 
     monkeypatch.setattr(evaluate, "rollout_job", watched_job)
     monkeypatch.setattr(evaluate, "rollout", watched_rollout)
-    training = "--suite toy --preset tiny --steps 2 --demonstrations 3 --base-tasks 1"
+    novel = ["touch-green", "touch-blue"]
+    monkeypatch.setattr(ToySimulator, "tasks", lambda self, suite: (["touch-red"], novel))
+    training = "--suite toy --preset tiny --steps 2 --demonstrations 3"
     call(train, f"{training} --evaluate-on novel --episodes 1 --out run {CPU}")
     titles = ["own demonstration", "another task's", "none"]
     expected = [*titles, *(f"{title}, after an inner step" for title in titles)]
-    assert lengths("run") == {title: {"touch-blue": 1} for title in expected}
-    assert measured == [(control, steps) for steps in (0, 1) for control in (None, None, "zeros")]
-    assert films == [["touch-blue"]]
+    assert lengths("run") == {title: dict.fromkeys(novel, 1) for title in expected}
+    of_each_task = [(control, steps) for steps in (0, 1) for control in (None, None, "zeros")]
+    assert measured == [how for how in of_each_task for _ in novel]
+    assert films == [novel]
     trained = model.load("run/ema-00002.pt")[0].denoiser.head[1].bias
     adapted = [not torch.equal(bias, trained) for bias in biases]
-    assert adapted == [False] * 3 + [True] * 3 + [False]  # the last one is the animation's
+    assert adapted == [False] * 6 + [True] * 6 + [False] * 2  # the last two are the animation's
     printed = capsys.readouterr().out
     assert all(f"| {title} " in printed for title in expected)
     assert len(load_demonstrations("data/touch-blue.npz")) == ToySimulator.demonstrations
 
     measured.clear()
     call(train, f"{training} --evaluate-on novel --episodes 1 --maml off --out off {CPU}")
-    assert list(lengths("off")) == titles and len(measured) == 3
+    assert list(lengths("off")) == titles and len(measured) == 6
     call(train, f"{training} --evaluate-on novel --episodes 1 --demo-encoder none --out no {CPU}")
     assert list(lengths("no")) == ["no demonstration", "no demonstration, after an inner step"]
+
+    # Of a single task there is no other one.
+    monkeypatch.setattr(ToySimulator, "tasks", lambda self, suite: (["touch-red"], novel[:1]))
+    call(train, f"{training} --evaluate-on novel --episodes 1 --maml off --out one {CPU}")
+    assert list(lengths("one")) == ["own demonstration", "none"]
 
 
 def test_inner_steps_before_a_rollout_change_the_policy_by_its_own_rate(here, own_folder):

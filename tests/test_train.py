@@ -29,6 +29,7 @@ import model
 import report
 import simulator
 import train
+from tests import oracle
 
 ROOT = Path(train.__file__).resolve().parent
 SHORT = (
@@ -145,6 +146,18 @@ def test_a_batch_follows_from_its_seed_alone():
         assert not torch.equal(first["action"], other["action"])
 
 
+def test_support_and_query_of_a_batch_are_of_different_episodes():
+    recording = own_recording(180, ends=[60, 120, 180]) | {"meta": {}}
+    recording["state"][:] = np.repeat([0.0, 1.0, 2.0], 60)[:, None]  # tells the episode
+    policy = model.build_policy(model.PRESETS["tiny"])
+    sampler = data.WindowSampler(data.Demonstrations(**recording), policy.config)
+    settings = train.Settings(support=4, query=8)
+    for k in range(20):
+        batch = train.task_batch(policy, sampler, torch.zeros(512), 12, (0, k), settings)
+        support, query = (set(x["state"].unique().tolist()) for x in model.split(batch, 4))
+        assert not support & query
+
+
 def test_a_share_of_the_batches_sees_no_instruction_and_of_inner_steps_nothing():
     policy, sampler = one_task()
 
@@ -201,6 +214,31 @@ def test_the_tasks_of_a_step_and_of_a_training_follow_from_the_seed():
     assert train.draw_base_tasks(names, train.Settings()) == names
     with pytest.raises(common.UserError, match="--base-tasks is 11: ml10 has 10"):
         train.draw_base_tasks(names, train.Settings(base_tasks=11))
+
+
+def test_the_world_in_which_weights_are_frozen_trains_rates_alone(monkeypatch):
+    """Before, training ends as if it were all; a world of tests.oracle."""
+    schedule = train.learning_rate
+    monkeypatch.setattr(train, "learning_rate", schedule)  # undone at the end
+    oracle.frozen()
+    settings = train.Settings(steps=40, pretrain_fraction=0.5, lr=1e-3, rate_lr=1e-2, warmup=4)
+    weights = [train.learning_rate(step, settings, peak=1e-3) for step in range(40)]
+    alone = replace(settings, steps=20)
+    assert weights[:20] == [schedule(step, alone, peak=1e-3) for step in range(20)]
+    assert weights[20:] == [0.0] * 20
+    assert train.learning_rate(30, settings, peak=1e-2) == 1e-2
+
+
+def test_the_world_without_an_average_keeps_the_last_weights(monkeypatch):
+    monkeypatch.setattr(train, "ema_model", train.ema_model)
+    oracle.not_averaged()
+    policy = model.build_policy(model.PRESETS["tiny"])
+    average = train.ema_model(policy)
+    for _ in range(3):
+        for p in policy.parameters():
+            p.data += 1
+        average.update_parameters(policy)
+    assert same_bits(dict(average.module.state_dict()), dict(policy.state_dict()))
 
 
 def test_products_in_bfloat16_leave_nearly_the_same_gradient():
@@ -266,7 +304,8 @@ def plain_meta_training(policy, samplers, text, settings):
         theta = {name: p.requires_grad_() for name, p in theta.items()}
         log_rates = {name: x.requires_grad_() for name, x in log_rates.items()}
         after, before = [], []
-        for i, (task, sampler) in enumerate(samplers.items()):
+        for i in train.tasks_of_step(step, len(samplers), settings):
+            task, sampler = list(samplers.items())[i]
             seed = np.random.SeedSequence((settings.seed, step, i)).generate_state(2, np.uint64)[0]
             generator = torch.Generator().manual_seed(int(seed))
             batch = sampler.batch(n, generator) | policy.draw_noise_and_timesteps(n, generator)
@@ -305,9 +344,9 @@ def plain_meta_training(policy, samplers, text, settings):
         yield theta, average, log_rates, loss.item(), torch.stack(before).mean().item(), norm.item()
 
 
-@pytest.mark.parametrize("learned", [False, True])
+@pytest.mark.parametrize(("learned", "tasks_per_step"), [(False, None), (True, None), (False, 1)])
 def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_written_out(
-    monkeypatch, learned
+    monkeypatch, learned, tasks_per_step
 ):
     monkeypatch.setattr(train, "LOSS_BEFORE_EVERY", 2)
     samplers, text = two_tasks()
@@ -322,6 +361,7 @@ def test_training_is_a_plain_loop_with_the_inner_step_adamw_and_the_average_writ
         lr=1e-2,
         warmup=2,
         vectorize=2,
+        tasks_per_step=tasks_per_step,
     )
     state = train.start_training(model.PRESETS["tiny"], settings, samplers, "cpu")
     policy = state.policy.double()  # in place: the optimizer's parameters, too
@@ -367,8 +407,15 @@ def first_step(folder, options=""):
 FLAGS = (
     *("--augment", "--after-success 3", "--seed 1", "--inner-lr 0.5", "--lr 1", "--support 5"),
     *("--query 9", "--instruction-dropout 1", "--task-dropout 1", "--maml first", "--maml off"),
-    "--maml off --bfloat16",
+    *("--maml off --bfloat16", "--augment --one-map", "--after-success 3 --late-fraction 0.5"),
+    *("--warmup 1", "--tasks-per-step 1", "--demonstrations 1"),
 )
+# What the first step does not show
+LATER = {
+    *("steps", "checkpoint_every", "evaluate_every", "episodes", "evaluate_on", "held_out"),
+    *("pretrain_fraction", "vectorize", "learn_inner_lr", "rate_lr", "suite", "preset"),
+    "base_tasks",  # of own recordings all are trained on
+}
 
 
 def test_every_flag_changes_the_training(pair):
@@ -382,6 +429,8 @@ def test_every_flag_changes_the_training(pair):
     assert len(set(figures.values())) == len(figures) - 1
     rounded, exact = lines["--maml off --bfloat16"]["loss"], lines["--maml off"]["loss"]
     assert rounded == pytest.approx(exact, rel=0.05)
+    named = {flag[2:].replace("-", "_") for flag in " ".join(FLAGS).split() if flag[:2] == "--"}
+    assert named | LATER == set(asdict(train.Settings()))
 
 
 def test_the_seed_draws_the_weights_and_all_tasks_scale_the_normalizer(pair):
@@ -613,7 +662,7 @@ WAYS = {
 }
 
 
-def test_every_way_of_training_learns_something_of_its_own(pair, tmp_path):
+def test_every_way_of_training_has_a_gradient_of_its_own(pair, tmp_path):
     def first_lines(name, options):
         argv = [*SHORT, *options.split(), "--steps", "2", "--inner-lr", "0.1"]
         train.main([*argv, "--data", str(pair), "--out", str(tmp_path / name)])
@@ -865,6 +914,19 @@ def test_own_recordings_of_any_length_and_dimension_are_trained_on_and_adapted_t
     finetune.main(["--data", "own/pour.npz", *checkpoint, "--steps", "2"])
     assert weights("runs/finetune/pour-seed0/adapted.pt")[1]["adapted_to"] == "pour"
     assert "base tasks" not in capsys.readouterr().out
+
+
+def test_the_loss_of_tasks_whose_demonstrations_differ_in_length_is_the_mean_of_theirs():
+    policy = model.build_policy(model.PRESETS["tiny"])
+    recording = data.Demonstrations(**own_recording(150, ends=[60, 150]) | {"meta": {}})
+    sampler = data.WindowSampler(recording, policy.config)
+    text = torch.zeros(512)
+    batches = [
+        train.task_batch(policy, sampler, text, 4, (0, k), train.Settings()) for k in range(6)
+    ]
+    assert len({batch["demo_points"].shape for batch in batches}) == 2
+    mean = torch.stack([policy.loss(**batch) for batch in batches]).mean()
+    torch.testing.assert_close(train.multi_task_loss(policy, batches), mean)
 
 
 def test_what_looks_wrong_in_recordings_is_said_before_training(capsys, monkeypatch):
