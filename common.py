@@ -1,8 +1,8 @@
 """What every script does the same way. Nothing here is part of the method: skip it when reading.
 
 Settings become flags; a user's mistake ends in one line and exit code 2; a folder belongs to one
-run; Ctrl-C lets the step at hand finish; work is shared among processes. Nothing of the project is
-imported; only some flags and messages name what its scripts work on.
+run; Ctrl-C lets the step at hand finish; work is shared among processes. The file imports nothing
+of the project, but some flags and messages mention its policies and tasks.
 """
 
 import argparse
@@ -212,6 +212,13 @@ def pick_device(name: str | None, threads: int | None = None) -> torch.device:
     return device
 
 
+def usable_cores() -> int:
+    """The cores that this process may use, which on shared machines are not all that there are."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def hardware(device: str | torch.device = "cpu") -> str:
     """The name of the processor that results are measured on, and how many cores it has."""
     if torch.device(device).type == "cuda":
@@ -222,7 +229,7 @@ def hardware(device: str | torch.device = "cpu") -> str:
     except OSError:
         models = []
     name = models[0] if models else platform.processor() or platform.machine()
-    return f"{name}, {os.cpu_count()} cores"
+    return f"{name}, {usable_cores()} cores"
 
 
 def provenance(script: str, argv: Sequence[str] | None, device: str | torch.device) -> dict:
@@ -375,6 +382,8 @@ class StopRequest:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
+        with suppress(OSError):  # print is not safe in a signal handler
+            os.write(2, b"\nstopping after the step at hand; once more stops at once\n")
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
@@ -409,7 +418,7 @@ class WorkerPool:
     def __init__(self, workers: int | None = None):
         if workers is not None and workers < 1:
             raise UserError(f"--workers is {workers}: use at least 1")
-        self.workers = workers or os.cpu_count() or 1
+        self.workers = workers or usable_cores()
         context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
         self.existing_children = set(multiprocessing.active_children())
         self.started = False  # whether a process ever was

@@ -62,6 +62,8 @@ from report import Outcomes, paper_columns, write_report
 from simulator import EPISODE_SEEDS, Simulator, episode_seed, evaluation_seed, simulator_of
 
 Batch = dict[str, Tensor]  # "states" (B, S), "actions" (B, A), "advantages" (B,)
+# Processes exchange arrays, since tensors go through shared memory, a file of it each.
+Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,8 @@ class Settings:
     same in all states, are our choice.
     """
 
-    seed: int = setting(0, "of weights, goals and actions", least=0, most=999)
+    seed: int = setting(0, "of weights, goals and actions in training", least=0, most=999)
+    evaluation_seed: int = setting(0, "of the goals that are measured", least=0, most=999)
     steps: int = setting(20_000_000, "of the simulator, in all rollouts", least=1)
     goals: int = setting(20, "goals of an iteration", least=1)
     rollouts: int = setting(10, "rollouts to a goal, before the inner step and after it", least=1)
@@ -87,7 +90,7 @@ class Settings:
     damping: float = setting(1e-5, "added to the Fisher matrix's diagonal", least=0)
     backtracks: int = setting(15, "steps that the line search tries", least=1)
     backtrack_ratio: float = setting(
-        0.8, "length of each step that it tries, relative to the one before", least=0, most=1
+        0.8, "by how much the line search shortens the step each time", least=0, most=1
     )
     episodes: int = setting(20, "goals of each task that are measured", least=1)
 
@@ -103,6 +106,7 @@ class GaussianPolicy(nn.Module):
 
     def __init__(self, state_dim: int, action_dim: int, hidden: int):
         super().__init__()
+        self.shape = (state_dim, action_dim, hidden)
         self.mean = nn.Sequential(
             nn.Linear(state_dim, hidden),
             nn.Tanh(),
@@ -126,6 +130,27 @@ class GaussianPolicy(nn.Module):
         """
         mean, log_std = functional_call(self, params, batch["states"])
         return -(log_probability(mean, log_std, batch["actions"]) * batch["advantages"]).mean()
+
+
+def to_arrays(params: Params) -> Arrays:
+    """Parameters as arrays of their own."""
+    return {name: p.detach().numpy().copy() for name, p in params.items()}
+
+
+def policy_of(weights: Arrays) -> GaussianPolicy:
+    """The policy that has these weights."""
+    hidden, state_dim = weights["mean.0.weight"].shape
+    policy = GaussianPolicy(state_dim, len(weights["log_std"]), hidden)
+    policy.load_state_dict({name: torch.from_numpy(x) for name, x in weights.items()})
+    return policy
+
+
+def mean_action(weights: Arrays, state: np.ndarray) -> np.ndarray:
+    """`GaussianPolicy.mean` of a state (S,): the action (A,). In NumPy, since steps are small."""
+    x = state
+    for layer in ("mean.0", "mean.2"):
+        x = np.tanh(weights[f"{layer}.weight"] @ x + weights[f"{layer}.bias"])
+    return weights["mean.4.weight"] @ x + weights["mean.4.bias"]
 
 
 def log_probability(mean: Tensor, log_std: Tensor, actions: Tensor) -> Tensor:
@@ -152,13 +177,15 @@ def environment(simulator: Simulator, task: str) -> Any:
     """The environment of a task. Each process keeps the 16 that it used last."""
     env = simulator.make(task, simulator.recipe["num_points"])
     if not hasattr(env, "state_without_goal"):
-        raise UserError(f"{simulator.name} has no low-dimensional states: use --suite ml10 or ml45")
+        raise UserError(
+            f"{simulator.name} has no low-dimensional states: use a suite of Meta-World, as ml10"
+        )
     return env
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One goal of a task, and what is random on the way to it."""
+    """A goal of a task, with the seeds of its episode and of the actions."""
 
     task: str
     seed: int  # of the episode: its start and its goal
@@ -171,23 +198,22 @@ def draw_noise(goal: Goal, rollouts: int, steps: int, action_dim: int) -> np.nda
     return rng.standard_normal((rollouts, steps, action_dim), dtype=np.float32)
 
 
-def roll_out(env: Any, policy: GaussianPolicy, goal: Goal, noise: np.ndarray) -> Rollouts:
+def roll_out(env: Any, weights: Arrays, goal: Goal, noise: np.ndarray) -> Rollouts:
     """Rolls a policy out, always from the same start to the same goal.
 
     Args:
         env: an environment that has `state_without_goal`.
+        weights: the policy's.
         goal: where to.
         noise: (R, T, A), see `draw_noise`; zeros give the means.
     """
-    std = policy.log_std.exp().detach().numpy()
+    std = np.exp(weights["log_std"])
     states, actions, rewards, successes = [], [], [], []  # of all steps, one after the other
     for noise_of_rollout in noise:
         env.begin(goal.seed)
         for noise_of_step in noise_of_rollout:
             state = env.state_without_goal()
-            with torch.inference_mode():
-                mean, _ = policy(torch.from_numpy(state))
-            action = mean.numpy() + std * noise_of_step
+            action = mean_action(weights, state) + std * noise_of_step
             reward, _, info = env.advance(action)
             states.append(state)
             actions.append(action)
@@ -228,7 +254,7 @@ def baseline_values(rollouts: Rollouts, returns: np.ndarray) -> np.ndarray:
     return features @ weights
 
 
-def to_batch(rollouts: Rollouts, settings: Settings) -> Batch:
+def to_batch(rollouts: Rollouts, settings: Settings) -> Arrays:
     """The states and actions of rollouts, with the advantages of the actions.
 
     Those are of generalized advantage estimation (Schulman et al. 2016), with mean 0 and standard
@@ -236,6 +262,7 @@ def to_batch(rollouts: Rollouts, settings: Settings) -> Batch:
     """
     rewards = rollouts.rewards
     values = baseline_values(rollouts, discounted_sums(rewards, settings.discount))
+    # The end of an episode counts as terminal, as in the benchmark: the baseline knows the time.
     next_values = np.concatenate([values[:, 1:], np.zeros((len(values), 1))], axis=1)
     deltas = rewards + settings.discount * next_values - values
     advantages = discounted_sums(deltas, settings.discount * settings.gae_lambda)
@@ -245,22 +272,19 @@ def to_batch(rollouts: Rollouts, settings: Settings) -> Batch:
         "actions": rollouts.actions.reshape(-1, rollouts.actions.shape[-1]),
         "advantages": advantages.reshape(-1),
     }
-    return {name: torch.from_numpy(x.astype(np.float32)) for name, x in batch.items()}
+    return {name: x.astype(np.float32) for name, x in batch.items()}
 
 
-def adapted_policy(policy: GaussianPolicy, support: Batch, settings: Settings) -> GaussianPolicy:
-    """The policy after one inner step on rollouts to a goal."""
-    params = dict(policy.named_parameters())
-    adapted = GaussianPolicy(*policy_shape(policy))
-    with torch.no_grad():
-        adapted.load_state_dict(adapt(policy.loss, params, support, lr=settings.inner_lr))
-    return adapted
+def to_tensors(batch: Arrays) -> Batch:
+    """A batch that a process returned."""
+    return {name: torch.from_numpy(x) for name, x in batch.items()}
 
 
-def policy_shape(policy: GaussianPolicy) -> tuple[int, int, int]:
-    """The arguments of the constructor: state_dim, action_dim, hidden."""
-    first, last = policy.mean[0], policy.mean[-1]
-    return first.in_features, last.out_features, first.out_features
+def adapted_weights(weights: Arrays, support: Arrays, settings: Settings) -> Arrays:
+    """The weights after one inner step on rollouts to a goal."""
+    policy = policy_of(weights)
+    params = {name: p.detach() for name, p in policy.named_parameters()}
+    return to_arrays(adapt(policy.loss, params, to_tensors(support), lr=settings.inner_lr))
 
 
 # ---- One iteration -------------------------------------------------------------------------------
@@ -272,9 +296,9 @@ ORDER, TRAINING, MEASURING = range(3)
 
 @dataclass
 class Sample:
-    """What is learned from some rollouts to a goal, and how they went."""
+    """The batch that rollouts to a goal make, with their mean return and success."""
 
-    batch: Batch
+    batch: Arrays
     mean_return: float
     success: float  # the share of rollouts that were a success at any step
 
@@ -289,15 +313,15 @@ def to_sample(rollouts: Rollouts, settings: Settings) -> Sample:
 
 
 def goal_job(
-    goal: Goal, simulator: Simulator, policy: GaussianPolicy, settings: Settings
+    goal: Goal, simulator: Simulator, weights: Arrays, settings: Settings
 ) -> tuple[Sample, Sample]:
     """Rollouts to one goal before and after the inner step: support and query."""
-    R, T, A = settings.rollouts, simulator.episode_steps, len(policy.log_std)
+    R, T, A = settings.rollouts, simulator.episode_steps, len(weights["log_std"])
     env = environment(simulator, goal.task)
     noise = draw_noise(goal, 2 * R, T, A)
-    support = to_sample(roll_out(env, policy, goal, noise[:R]), settings)
+    support = to_sample(roll_out(env, weights, goal, noise[:R]), settings)
     report_progress(goal.task, R * T)
-    adapted = adapted_policy(policy, support.batch, settings)
+    adapted = adapted_weights(weights, support.batch, settings)
     query = to_sample(roll_out(env, adapted, goal, noise[R:]), settings)
     report_progress(goal.task, R * T)
     return support, query
@@ -391,7 +415,7 @@ class AdaptedPolicies:
 
 def trpo_step(
     policy: GaussianPolicy, support: list[Batch], query: list[Batch], settings: Settings
-) -> tuple[float, int]:
+) -> dict[str, float]:
     """Changes the policy's parameters so that it is better after the inner step.
 
     The natural gradient H^-1 g gives the direction. The step goes as far as `max_kl` allows, and is
@@ -403,7 +427,8 @@ def trpo_step(
         support, query: the batches of the goals, of the same goal at the same place.
 
     Returns:
-        The divergence of the step (0 if nothing was changed), and how often it was shortened.
+        Figures of the step: its divergence, "kl" (0 if nothing was changed); how often it was
+        shortened, "backtracks"; and TRPO's outer loss before and after it.
     """
     params = {name: p.detach() for name, p in policy.named_parameters()}
     gradient, _, _ = meta_gradient(
@@ -429,17 +454,21 @@ def trpo_step(
             candidate = {name: p - change[name] for name, p in params.items()}
             loss, kl = adapted.surrogate_loss_and_kl(candidate, old)
             if loss < old_loss and kl <= settings.max_kl:
-                # Workers share the memory of the weights, but their jobs have ended.
                 policy.load_state_dict(candidate)
-                return kl, n
-    return 0.0, settings.backtracks
+                return {"kl": kl, "backtracks": n, "loss_before": old_loss, "loss_after": loss}
+    return {
+        "kl": 0.0,
+        "backtracks": settings.backtracks,
+        "loss_before": old_loss,
+        "loss_after": old_loss,
+    }
 
 
 # ---- Training ------------------------------------------------------------------------------------
 
 
 def tasks_of_iteration(tasks: Sequence[str], iteration: int, settings: Settings) -> list[str]:
-    """The task of each goal of an iteration; a task comes as often as any other, or once more."""
+    """The task of each goal of an iteration. How often two tasks come differs by one at most."""
     rng = np.random.default_rng((ORDER, settings.seed, iteration))
     return np.resize(rng.permutation(tasks), settings.goals).tolist()
 
@@ -452,35 +481,41 @@ def iterate(
     iteration: int,
     settings: Settings,
     bar: Any,
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """One iteration: rollouts to all its goals, then a step of TRPO. Returns its figures."""
-    jobs = []
-    for i, task in enumerate(tasks_of_iteration(tasks, iteration, settings)):
-        number = (iteration * settings.goals + i) % EPISODE_SEEDS
-        goal = Goal(
+    goals = [
+        Goal(
             task,
-            seed=episode_seed(settings.seed, number),
+            seed=episode_seed(settings.seed, (iteration * settings.goals + i) % EPISODE_SEEDS),
             noise_seed=(TRAINING, settings.seed, iteration, i),
         )
-        jobs.append({"goal": goal, "simulator": simulator, "policy": policy, "settings": settings})
+        for i, task in enumerate(tasks_of_iteration(tasks, iteration, settings))
+    ]
+    weights = to_arrays(dict(policy.named_parameters()))
+    arguments = {"simulator": simulator, "weights": weights, "settings": settings}
+    jobs = [{"goal": goal, **arguments} for goal in goals]
     support, query = zip(*pool.run(goal_job, jobs, bar))
-    kl, backtracks = trpo_step(
+    figures_of_step = trpo_step(
         policy,
-        support=[sample.batch for sample in support],
-        query=[sample.batch for sample in query],
+        support=[to_tensors(sample.batch) for sample in support],
+        query=[to_tensors(sample.batch) for sample in query],
         settings=settings,
     )
+    success_of_tasks: dict[str, list[float]] = {}
+    for goal, sample in zip(goals, query):
+        success_of_tasks.setdefault(goal.task, []).append(sample.success)
     return {
         "return_before": float(np.mean([sample.mean_return for sample in support])),
         "return_after": float(np.mean([sample.mean_return for sample in query])),
         "success_before": float(np.mean([sample.success for sample in support])),
         "success_after": float(np.mean([sample.success for sample in query])),
-        "kl": kl,
-        "backtracks": backtracks,
+        "success_of_tasks": {task: float(np.mean(x)) for task, x in success_of_tasks.items()},
+        "std": np.exp(weights["log_std"]).tolist(),  # of the actions' numbers
+        **figures_of_step,
     }
 
 
-FREE_TO_CHANGE = ("steps", "episodes")  # when a run is resumed
+FREE_TO_CHANGE = ("steps", "episodes", "evaluation_seed")  # when a run is resumed
 
 
 @dataclass
@@ -500,7 +535,7 @@ def save(path: Path, run: Run, settings: Settings, suite: str) -> None:
     content = {
         "suite": suite,
         "settings": asdict(settings),
-        "shape": policy_shape(run.policy),
+        "shape": run.policy.shape,
         "weights": run.policy.state_dict(),
         "iteration": run.iteration,
         "seconds": run.seconds,
@@ -604,7 +639,7 @@ def train(
 
 
 def measure_job(
-    goal: Goal, simulator: Simulator, policy: GaussianPolicy, settings: Settings
+    goal: Goal, simulator: Simulator, weights: Arrays, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
     """The successes (T,) of one rollout before the inner step, and of one after it.
 
@@ -612,12 +647,12 @@ def measure_job(
     start and goal.
     """
     env = environment(simulator, goal.task)
-    T, A = simulator.episode_steps, len(policy.log_std)
+    T, A = simulator.episode_steps, len(weights["log_std"])
     noise = draw_noise(goal, settings.rollouts, T, A)
     no_noise = np.zeros((1, T, A), dtype=np.float32)
-    before = roll_out(env, policy, goal, no_noise)
-    support = to_batch(roll_out(env, policy, goal, noise), settings)
-    after = roll_out(env, adapted_policy(policy, support, settings), goal, no_noise)
+    before = roll_out(env, weights, goal, no_noise)
+    support = to_batch(roll_out(env, weights, goal, noise), settings)
+    after = roll_out(env, adapted_weights(weights, support, settings), goal, no_noise)
     report_progress(goal.task, 1)
     return before.successes[0], after.successes[0]
 
@@ -630,15 +665,15 @@ def measure(
     workers: int | None,
 ) -> dict[str, Outcomes]:
     """Rolls the policy out on new goals of each task, before and after an inner step."""
+    seed = settings.evaluation_seed
     goals = [
-        Goal(task, seed=evaluation_seed(settings.seed, i), noise_seed=(MEASURING, settings.seed, i))
-        for task in tasks
+        Goal(task, seed=evaluation_seed(seed, i), noise_seed=(MEASURING, seed, number, i))
+        for number, task in enumerate(tasks)
         for i in range(settings.episodes)
     ]
-    jobs = [
-        {"goal": goal, "simulator": simulator, "policy": policy, "settings": settings}
-        for goal in goals
-    ]
+    weights = to_arrays(dict(policy.named_parameters()))
+    arguments = {"simulator": simulator, "weights": weights, "settings": settings}
+    jobs = [{"goal": goal, **arguments} for goal in goals]
     results = run_jobs(
         measure_job, jobs, workers=workers, total=len(jobs), description="evaluating", unit="goal"
     )
@@ -659,9 +694,10 @@ def measure(
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Trains MAML-TRPO on a suite and measures it.")
-    parser.add_argument("--suite", default="ml10", help="of Meta-World, such as ml10, ml45 (ml10)")
+    parser.add_argument("--suite", default="ml10", help="of Meta-World, such as ml10 (ml10)")
     parser.add_argument("--out", help="folder of the run (runs/rl-SUITE-seedN)")
     parser.add_argument("--resume", action="store_true", help="go on with the run in --out")
+    parser.add_argument("--overwrite", action="store_true", help="replace the results in --out")
     parser.add_argument("--workers", type=int, help="processes that roll out (one a core)")
     add_settings(parser, Settings, {"default": Settings()})
     return parser.parse_args(argv)
@@ -675,20 +711,24 @@ def main(argv: Sequence[str] | None = None) -> None:
     checkpoint = folder / "last.pt"
 
     with locked(folder):
+        if (folder / "success.json").exists() and not args.overwrite:
+            raise UserError(f"{folder} already holds results: add --overwrite, or another --out")
         if args.resume:
             run = restore(checkpoint, settings, args.suite)
         elif checkpoint.exists():
             raise UserError(f"{folder} already holds a run: add --resume, or another --out")
-        elif (folder / "success.json").exists():
-            raise UserError(f"{folder} already holds results: choose another --out")
         else:
             run = start(simulator, args.suite, settings)
         print_settings(asdict(settings), asdict(Settings()))
         steps = train(run, simulator, args.suite, settings, folder, args.workers)
         base_tasks, novel_tasks = simulator.tasks(args.suite)
-        outcomes = measure(
-            simulator, [*base_tasks, *novel_tasks], run.policy, settings, args.workers
-        )
+        try:
+            outcomes = measure(
+                simulator, [*base_tasks, *novel_tasks], run.policy, settings, args.workers
+            )
+        except KeyboardInterrupt:
+            advice = "the training is saved, add --resume to measure it"
+            raise KeyboardInterrupt(advice) from None
         parts = {"mean of base": base_tasks, "mean of novel": novel_tasks}
         table = write_report(
             folder,
@@ -698,7 +738,8 @@ def main(argv: Sequence[str] | None = None) -> None:
                 "steps": steps,
                 "training seconds": round(run.seconds),
                 "goals a task": settings.episodes,
-                "seed": settings.seed,
+                "seed": settings.evaluation_seed,
+                "training seed": settings.seed,
                 **provenance("rl.py", argv, "cpu"),
             },
             parts={name: tasks for name, tasks in parts.items() if tasks},

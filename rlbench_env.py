@@ -33,7 +33,7 @@ from data import farthest_point_sample
 from rlbench_data import CAMERAS, RECIPE, read_view, seen_points, state_of, target_of
 from simulator import OutOfSightError
 
-EPISODE_STEPS = 400  # our choice: 20 seconds, since demonstrations have 20 frames in each
+EPISODE_STEPS = 400  # our choice: 20 seconds, since demonstrations have 20 frames a second
 IMAGE_PIXELS = 128  # height and width of all images, as rlbench-generate-dataset has them
 RENDER_PIXELS = 240
 

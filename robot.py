@@ -1518,7 +1518,7 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
     text, _ = text_features([recording.instruction], args.clip_weights, info["text_weights"])
     if not info.get("adaptation", {}).get("instruction", True):  # adapted without it
         text = torch.zeros_like(text)
-    torch.set_num_threads(max(1, (os.cpu_count() or 1) - 1))  # a core is left to the servo stream
+    torch.set_num_threads(max(1, common.usable_cores() - 1))  # a core is left to the servo stream
     generator = torch.Generator().manual_seed(args.seed)
     demo = sampler.demonstration(sampler.sample_episode(generator))  # held for the whole run
     with torch.no_grad():

@@ -15,6 +15,7 @@ Letters: N points of an observation, S state dim, A action dim, T frames of an e
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -83,7 +84,7 @@ class Simulator(Protocol):
     instructions: dict[str, str]  # task -> what the robot is told; its order decides the seeds
     # How recordings are made: "simulator" (the name), "num_points" and more. With "success": "at
     # the end" an expert's episode is kept only if its last step is a success, too. With "made_by"
-    # there is no expert: that is a sentence of how a user makes the recordings.
+    # there is no expert: it then says how a user makes the recordings.
     recipe: dict[str, Any]
     packages: Sequence[str]  # whose versions are written into recordings
     demonstrations: int  # of a task, unless a command says otherwise
@@ -163,8 +164,16 @@ def check_task(simulator: Simulator, task: str) -> str:
     return choose(task, simulator.instructions, "task")
 
 
-# The environments of this process, and what they were made for.
-kept_environments: dict[str, Any] = {"environments": [], "made_for": None, "task": None}
+@dataclass
+class KeptEnvironments:
+    """The environments that this process used last, and what they were made for."""
+
+    made_for: tuple[Simulator, int] | None = None  # and how many points
+    task: str | None = None
+    environments: list[Environment] = field(default_factory=list)
+
+
+kept = KeptEnvironments()
 
 
 def environments_of(
@@ -172,23 +181,22 @@ def environments_of(
 ) -> list[Environment]:
     """Returns `number` environments of a task, whose clouds have `num_points` points.
 
-    The environments of the previous call are used again, also for another task if they can change
-    to it: the caller has to be done with those.
+    Environments of the previous call are used again, for another task if they can change to it. So
+    those must not be needed any more.
     """
-    kept = kept_environments
-    made_for = (simulator, num_points)
-    if kept["made_for"] != made_for:
-        kept["environments"] = []
-    elif kept["task"] != task:
-        kept["environments"] = [
+    environments, kept.environments = kept.environments, []  # forgotten, should anything fail
+    if kept.made_for != (simulator, num_points):
+        environments = []
+    elif kept.task != task:
+        environments = [
             environment
-            for environment in kept["environments"]
+            for environment in environments
             if hasattr(environment, "change_task") and environment.change_task(task)
         ]
-    kept.update(made_for=made_for, task=task)
-    while len(kept["environments"]) < number:
-        kept["environments"].append(simulator.make(task, num_points))
-    return kept["environments"][:number]
+    while len(environments) < number:
+        environments.append(simulator.make(task, num_points))
+    kept.made_for, kept.task, kept.environments = (simulator, num_points), task, environments
+    return environments[:number]
 
 
 # ---- Seeds of episodes ---------------------------------------------------------------------------

@@ -102,7 +102,7 @@ def nothing_kept(monkeypatch):
     """No test meets a policy or an environment that an earlier one left in this process."""
     evaluate.keep_policy.cache_clear()
     evaluate.keep_policy_of_task.cache_clear()
-    monkeypatch.setattr(simulator, "kept_environments", dict.fromkeys(simulator.kept_environments))
+    monkeypatch.setattr(simulator, "kept", simulator.KeptEnvironments())
 
 
 @pytest.fixture

@@ -46,8 +46,8 @@ def control_job(
                 if control == "replay":
                     action = actions[min(step, len(actions) - 1)]
                 elif control == "servo":
-                    hand = env.observe()["agent_pos"][:3]
-                    action = np.append(np.clip(STIFFNESS * (target - hand), -1, 1), actions[-1, 3])
+                    displacement = STIFFNESS * (target - env.hand())
+                    action = np.append(np.clip(displacement, -1, 1), actions[-1, 3])
                 else:
                     action = env.expert_action()
                 _, _, info = env.advance(action)

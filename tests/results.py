@@ -13,6 +13,7 @@ episode (1: success, 0: not) with the command, hardware, seed and date.
 import argparse
 import json
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -32,6 +33,7 @@ from report import (
     PAPER_RESULTS,
     Successes,
     format_success,
+    mean_interval,
     mean_success,
     paper_columns,
     plot_success,
@@ -168,9 +170,12 @@ def take(results: Results, run: Path) -> None:
     """
     if (run / "success.json").exists():
         report = read_report(run)
-        command = report["provenance"]["command"]
-        if "tests.controls" in command or "rl.py" in command:
+        script = shlex.split(report["provenance"]["command"])[1:3]  # or "-m" and a module
+        if script == ["-m", "tests.controls"]:
             results[run.name] = {"novel": report}
+            return
+        if script[0] == "rl.py":
+            results[run.name] = {"rl": report}
             return
     steps = []
     if (run / "config.json").exists():
@@ -262,7 +267,10 @@ def of_each_run(results: Results, variant: str, column: Column) -> list[float]:
 
 
 def mean(results: Results, variant: str, column: Column) -> str:
-    """The mean over tasks, with each run's own in brackets; of a single run with an interval."""
+    """The mean over a variant's trainings, with each training's own in brackets.
+
+    If there is only one training: its success with Wilson's interval.
+    """
     rates = of_each_run(results, variant, column)
     if not rates:
         return ""
@@ -436,7 +444,7 @@ def length_table(results: Results) -> str:
     for run in results.values():
         training = run.get("training", {})
         for label, tasks in run.get("top", {}).get("checkpoints", {}).items():
-            step = int(label[-5:])
+            step = int(re.search(r"\d+$", label)[0])
             minutes = training["minutes"] * step / training["arguments"]["steps"]
             episodes = "".join(tasks.values())
             success = format_success(episodes.count("1"), len(episodes))
@@ -884,9 +892,13 @@ def plot_by_task(results: Results, path: Path) -> None:
 
 
 def compare(results: Results, one: str, other: str) -> str:
-    """Episodes on the same goals that one variant wins and loses against another, seed by seed.
+    """Episodes on the same goals that one variant wins and loses against another.
 
-    A row a report that both have, of its column "after" or else its first; p: two-sided sign test.
+    Of each report that both have, its column "after" or else its first is compared: a row a seed of
+    training, and where there are several the mean difference, with Student's interval of 95 % over
+    these. p is of a two-sided sign test over episodes. It speaks of two trainings, and says nothing
+    of how far others would lie apart.
+
     Raises UserError for a variant of which there is no run.
     """
 
@@ -894,24 +906,30 @@ def compare(results: Results, one: str, other: str) -> str:
         after = on_all_goals(run, Column(report, "after"))
         return after or on_all_goals(run, Column(report))
 
-    rows = [["report", "won", "lost", "episodes", "p"]]
-    names = [name for name in results if name.startswith(f"{one}-seed")]
     for variant in (one, other):
         if not runs_of(results, variant):
             raise UserError(f"{RESULTS.name} has no run of {variant}")
+    rows = [["report", "seed", "won", "lost", "episodes", "difference, points", "p"]]
+    names = [name for name in results if re.fullmatch(rf"{re.escape(one)}-seed\d+", name)]
     for report in REPORT_NAMES:
         if report.endswith(AGAIN):  # these episodes are counted with those of the report itself
             continue
-        outcomes = []
+        differences = []
         for name in names:
             ours = episodes_of(results[name], report)
             theirs = episodes_of(results.get(name.replace(one, other, 1), {}), report)
-            if ours and theirs:
-                outcomes += pairs(ours, theirs)
-        if outcomes:
+            if not ours or not theirs:
+                continue
+            outcomes = pairs(ours, theirs)
             won, lost = outcomes.count((True, False)), outcomes.count((False, True))
+            difference = 100 * (won - lost) / len(outcomes)
             p = binomtest(won, won + lost).pvalue if won + lost else 1.0
-            rows.append([report, str(won), str(lost), str(len(outcomes)), f"{p:.4f}"])
+            seed = name.rpartition("-seed")[2]
+            cells = [seed, won, lost, len(outcomes), f"{difference:+.1f}", f"{p:.4f}"]
+            rows.append([report, *map(str, cells)])
+            differences.append(difference)
+        if len(differences) > 1:
+            rows.append([report, "mean", "", "", "", mean_interval(differences), ""])
     return format_table(rows)
 
 

@@ -116,9 +116,8 @@ REPORTS |= {
 # batches, and some of them take inner steps. A step without inner step takes a fifth of the time of
 # one with, so that "neither-as-long" has as many minutes as "inner" on reach.
 NO_DEMONSTRATION = "--demo-encoder none --tasks-per-step 12 --support 8 --query 4 --lr 1e-3"
-INNER = (
-    f"{NO_DEMONSTRATION} --pretrain-fraction 0.2 --vectorize 12 --learn-inner-lr --inner-lr 3e-2"
-)
+LEARNED_RATES = f"{NO_DEMONSTRATION} --vectorize 12 --learn-inner-lr --inner-lr 3e-2"
+INNER = f"{LEARNED_RATES} --pretrain-fraction 0.2"
 HIDDEN_METHOD = {
     "demonstration": "--maml off",
     "demonstration-twice-the-rate": "--maml off --lr 1e-3",
@@ -129,7 +128,7 @@ HIDDEN_METHOD = {
     "both": "",
     # In worlds of tests.oracle: rates of the inner step are learned for the weights of "neither",
     # after its 1,500 steps; and the cloud shows the goal
-    "frozen": INNER.replace("--pretrain-fraction 0.2", "--pretrain-fraction 0.75 --steps 2000"),
+    "frozen": f"{LEARNED_RATES} --pretrain-fraction 0.75 --steps 2000",
     "marker": "--maml off --demo-encoder none --data data-marker",
     # Fewer or more goals than the 160 of "demonstration", and as many windows a step, 80
     "demonstration-5-goals": "--maml off --base-tasks 5 --tasks-per-step 5 --support 8 --query 8",
@@ -251,6 +250,9 @@ def plan_of(suite: str) -> Plan:
     return Plan(VARIANTS, REPORTS, episodes=EPISODES)
 
 
+running: set[subprocess.Popen] = set()  # the processes of this queue
+
+
 @dataclass(frozen=True)
 class Job:
     """A command whose result is a file."""
@@ -274,7 +276,11 @@ class Job:
         with self.log.open("a") as log:
             print(f"$ python {self.command}", file=log, flush=True)
             words = [sys.executable, *self.command.split()]
-            return subprocess.run(words, stdout=log, stderr=log).returncode
+            process = subprocess.Popen(words, stdout=log, stderr=log)
+            running.add(process)
+            code = process.wait()
+            running.discard(process)
+            return code
 
 
 def steps_of(suite: str, flags: str) -> int:
@@ -377,8 +383,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     with ThreadPoolExecutor(args.at_once) as pool:
         try:
             failed = sum(pool.map(partial(run_in_order, stopped=stopped), runs))
-        finally:
+        except KeyboardInterrupt:  # also of `kill`, which does not reach the processes by itself
             stopped.set()
+            for process in list(running):
+                process.terminate()  # a training saves, and ends
+            raise
     if failed:
         sys.exit(1)
 

@@ -238,8 +238,7 @@ def recordings(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hidden_goals, "CAMERA_PIXELS", 24)
         # Without those that earlier tests left: their cameras have more rays.
-        none_kept = {"environments": [], "made_for": None, "task": None}
-        patch.setattr(simulator, "kept_environments", none_kept)
+        patch.setattr(simulator, "kept", simulator.KeptEnvironments())
         short = HiddenGoals(episode_steps=60)
         for task in (*BASE, *NEW):
             collect_task(short, task, folder / f"{task}.npz", episodes=2, seed=0)

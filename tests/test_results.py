@@ -11,7 +11,7 @@ import pytest
 from common import UserError
 from hidden_goals import SKILLS, names_of
 from model import PRESETS, PolicyConfig
-from report import wilson_interval
+from report import mean_interval, wilson_interval
 from simulator import SIMULATORS
 from tests.results import (
     HIDDEN_ROWS,
@@ -107,10 +107,18 @@ def test_a_comparison_counts_what_is_won_and_lost_on_the_same_goals():
     results = {"a-seed0": run("1100", "1111111"), "b-seed0": run("1011", "0000001")}
     for name, more in {"a-seed0": "111", "b-seed0": "101"}.items():
         results[name]["base-goals2"] = {"successes": {"last": {"reach": more}}}
-    results |= {"a-seed1": run("1111", "1111111"), "b-seed2": run("0000", "0000000")}  # no pair
+    results |= {"a-seed1": run("1111", "1111111"), "b-seed1": run("1110", "1111111")}
+    results |= {"a-seed2": run("1111", "1111111"), "b-seed3": run("0000", "0000000")}  # no pairs
     rows = [line.split("|")[1:-1] for line in compare(results, "a", "b").splitlines()[2:]]
     rows = [[cell.strip() for cell in row] for row in rows]
-    assert rows == [["base", "2", "2", "7", "1.0000"], ["novel", "6", "0", "7", "0.0312"]]
+    assert rows == [
+        ["base", "0", "2", "2", "7", "+0.0", "1.0000"],
+        ["base", "1", "1", "0", "4", "+25.0", "1.0000"],
+        ["base", "mean", "", "", "", mean_interval([0.0, 25.0]), ""],
+        ["novel", "0", "6", "0", "7", "+85.7", "0.0312"],
+        ["novel", "1", "0", "0", "7", "+0.0", "1.0000"],
+        ["novel", "mean", "", "", "", mean_interval([600 / 7, 0.0]), ""],
+    ]
 
 
 def test_a_report_is_done_unless_it_is_older_than_what_it_measures(tmp_path):
@@ -140,6 +148,10 @@ def test_only_runs_and_reports_that_stand_for_themselves_are_taken(tmp_path):
     taken = {}
     take(taken, tmp_path)
     assert taken[tmp_path.name]["novel"]["successes"] == {"a": {"reach": "1"}}
+    report["provenance"]["command"] = "python rl.py --suite ml10"
+    (tmp_path / "success.json").write_text(json.dumps(report))
+    take(taken, tmp_path)
+    assert taken[tmp_path.name] == {"rl": {**report, "successes": {"a": {"reach": "1"}}}}
     with pytest.raises(UserError, match="has no run of nobody"):
         compare(taken, "nobody", "nobody")
 

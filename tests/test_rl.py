@@ -74,7 +74,7 @@ POINT = Settings(goals=5, rollouts=5, hidden=32, cg_iterations=5)
 def random_batches(n, policy, seed=0):
     """(support, query) of n tasks, in float64."""
     generator = torch.Generator().manual_seed(seed)
-    state_dim, action_dim, _ = rl.policy_shape(policy)
+    state_dim, action_dim, _ = policy.shape
 
     def batch():
         def draw(*shape):
@@ -144,11 +144,13 @@ def test_a_step_improves_the_loss_and_keeps_to_the_divergence(adapted):
     settings = replace(POINT, inner_lr=policies.inner_lr, max_kl=0.02)
     old = policies.gaussians(params)
     old_loss, _ = policies.surrogate_loss_and_kl(params, old)
-    told_kl, _ = rl.trpo_step(policies.policy, support, query, settings)
+    figures = rl.trpo_step(policies.policy, support, query, settings)
     new = {name: p.detach() for name, p in policies.policy.named_parameters()}
     loss, kl = policies.surrogate_loss_and_kl(new, old)
     assert loss < old_loss - 0.01 and 0.005 < kl <= 0.02
-    assert told_kl == pytest.approx(kl)
+    assert figures["kl"] == pytest.approx(kl)
+    assert figures["loss_before"] == pytest.approx(old_loss)
+    assert figures["loss_after"] == pytest.approx(loss)
 
 
 def test_a_step_into_nothing_is_no_error_but_is_not_taken(adapted):
@@ -164,9 +166,21 @@ def test_a_step_into_nothing_is_no_error_but_is_not_taken(adapted):
 def test_where_no_step_is_good_enough_nothing_is_changed(adapted):
     policies, params, support, query = adapted
     settings = replace(POINT, inner_lr=policies.inner_lr, max_kl=0.0)  # no step keeps to that
-    assert rl.trpo_step(policies.policy, support, query, settings) == (0.0, POINT.backtracks)
+    figures = rl.trpo_step(policies.policy, support, query, settings)
+    assert (figures["kl"], figures["backtracks"]) == (0.0, POINT.backtracks)
     for name, p in policies.policy.named_parameters():
         assert torch.equal(p, params[name])
+
+
+def test_the_mean_action_in_numpy_is_that_of_the_policy():
+    torch.manual_seed(0)
+    policy = GaussianPolicy(5, 3, hidden=7)
+    weights = rl.to_arrays(dict(policy.named_parameters()))
+    state = np.random.default_rng(0).normal(size=5).astype(np.float32)
+    mean, _ = policy(torch.from_numpy(state))
+    np.testing.assert_allclose(rl.mean_action(weights, state), mean.detach(), atol=1e-6)
+    again = rl.to_arrays(dict(rl.policy_of(weights).named_parameters()))
+    assert all(np.array_equal(again[name], weights[name]) for name in weights)
 
 
 # ---- Advantages ----------------------------------------------------------------------------------
@@ -186,7 +200,7 @@ def test_what_the_state_and_the_time_foretell_is_no_advantage():
     rollouts = Rollouts(states, actions, rewards, successes=np.zeros((10, 20), bool))
     batch = rl.to_batch(rollouts, replace(POINT, discount=0.0))
     assert np.corrcoef(batch["advantages"], surprise.reshape(-1))[0, 1] > 0.95
-    assert batch["advantages"].mean().abs() < 1e-5
+    assert abs(batch["advantages"].mean()) < 1e-5
     assert batch["advantages"].std() == pytest.approx(1, abs=0.01)
 
 
@@ -221,11 +235,12 @@ def test_advantages_are_those_of_generalized_advantage_estimation():
 def returns(policy, goals=10, seed=1):
     """The mean returns to new goals before and after an inner step."""
     simulator = PointSimulator()
+    weights = rl.to_arrays(dict(policy.named_parameters()))
     samples = [
         rl.goal_job(
             rl.Goal("move", seed=rl.evaluation_seed(seed, i), noise_seed=(seed, i)),
             simulator,
-            policy,
+            weights,
             POINT,
         )
         for i in range(goals)
@@ -258,7 +273,7 @@ def test_each_iteration_has_goals_of_its_own_and_none_is_measured_on(monkeypatch
         return InProcessPool().run(job, jobs)
 
     monkeypatch.setattr(rl, "run_jobs", run_jobs)
-    monkeypatch.setattr(rl, "trpo_step", lambda *_, **__: (0.0, 0))
+    monkeypatch.setattr(rl, "trpo_step", lambda *_, **__: {})
     simulator = PointSimulator()
     for iteration in range(3):
         rl.iterate(Watched(), simulator, ["a", "b", "c"], policy, iteration, POINT, bar=None)
@@ -284,30 +299,36 @@ def point_suite(monkeypatch, tmp_path, no_pictures):
 def test_a_run_that_was_resumed_ends_with_the_same_weights(point_suite, monkeypatch):
     """Also where one of the two rolls out in another process."""
     rl.main([*point_suite, "160", "--out", "parts"])
-    rl.main([*point_suite, "240", "--out", "parts", "--resume"])
+    rl.main([*point_suite, "240", "--out", "parts", "--resume", "--overwrite"])
     monkeypatch.setattr(rl, "WorkerPool", lambda workers: common.WorkerPool(1))
     rl.main([*point_suite, "240", "--out", "whole"])  # three iterations of 80 steps
     whole, parts = (torch.load(f"{name}/last.pt", weights_only=True) for name in ("whole", "parts"))
     assert whole["iteration"] == parts["iteration"] == 3
     for name, weight in whole["weights"].items():
         assert torch.equal(weight, parts["weights"][name])
-    assert rl.read_json_lines(Path("parts/metrics.jsonl"))[-1]["steps"] == 240
+    last_line = rl.read_json_lines(Path("parts/metrics.jsonl"))[-1]
+    assert last_line["steps"] == 240 and len(last_line["std"]) == 2
+    assert last_line["success_of_tasks"] == {"move": last_line["success_after"]}
     report = json.loads(Path("parts/success.json").read_text())
     assert report["provenance"]["steps"] == 240
     assert set(report["successes"]) == {"before", "after one inner step"}
+
+
+AGAIN = "--resume --overwrite --out run".split()
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--resume", "--out", "nothing"], "there is no run to resume"),
-        (["--out", "run"], "add --resume, or another --out"),
-        (["--resume", "--out", "run", "--hidden", "9"], "trained with other settings (hidden"),
+        (["--out", "run"], "already holds results: add --overwrite, or another --out"),
+        (["--out", "run", "--overwrite"], "add --resume, or another --out"),
+        ([*AGAIN, "--hidden", "9"], "trained with other settings (hidden"),
         (["--resume", "--out", "damaged"], "is damaged"),
         (["--resume", "--out", "foreign"], "is of no run of rl.py"),
-        (["--out", "results"], "already holds results: choose another --out"),
+        (["--out", "results"], "already holds results: add --overwrite, or another --out"),
         (["--suite", "poin"], "did you mean 'point'"),
-        (["--resume", "--out", "run", "--steps", "80"], "160 are taken already"),
+        ([*AGAIN, "--steps", "80"], "160 are taken already"),
         (["--max-kl", "-1"], "--max-kl is -1.0: use at least 0"),
     ],
 )
@@ -340,5 +361,5 @@ def test_a_simulator_without_such_states_is_refused():
         def make(self, task, num_points):
             return object()
 
-    with pytest.raises(common.UserError, match="use --suite ml10"):
+    with pytest.raises(common.UserError, match="use a suite of Meta-World, as ml10"):
         rl.environment(SimulatorWithoutStates(), "move")
