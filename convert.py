@@ -62,7 +62,7 @@ from data import (
     suspicions,
 )
 from report import plot_demonstration
-from robot import depth_to_points, has_depth, thin
+from robot import depth_to_points, has_depth, is_pose, thin
 
 
 def refuse(path: Any, problem: str) -> NoReturn:
@@ -145,10 +145,7 @@ class Camera:
         if self.depth_scale is not None and self.depth_scale <= 0:
             raise ValueError("depth_scale: metres a unit of depth, such as 0.001")
         if self.camera_to_base is not None:
-            pose = np.array(self.camera_to_base, float)
-            rotation = pose[:3, :3]
-            rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-            if not rigid or np.linalg.det(rotation) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
+            if not is_pose(np.array(self.camera_to_base, float)):
                 raise ValueError(
                     "camera_to_base: its 3 x 3 must be a rotation, its last row 0 0 0 1"
                 )
@@ -285,16 +282,67 @@ def color_image(path: Path, name: str, color: np.ndarray, depth: np.ndarray) -> 
     return color[..., :3]
 
 
-def intrinsics_of(path: Path, name: str, intrinsics: np.ndarray) -> list[float]:
-    """fx, fy, cx, cy of four numbers, or of a matrix (3, 3)."""
+# What the name of an array may say beside which camera it is of. Not "color": the intrinsics of a
+# color image are not those of depth.
+NO_CAMERA = {
+    *("obs", "observation", "observations", "images", "image", "sensor", "data", "param", "params"),
+    *("camera", "cam", "depth", "intrinsic", "intrinsics", "extrinsic", "extrinsics", "cv", "k"),
+    "matrix",
+}
+
+
+def camera_of(name: str) -> set[str]:
+    """What the name of an array says of its camera: of obs/front_depth {"front"}."""
+    return set(re.split(r"\W|_", name.lower())) - NO_CAMERA - {""}
+
+
+def of_same_camera(path: Path, depth: str, found: list[str]) -> str | None:
+    """Which of the intrinsics or extrinsics `found` are of the camera of the depth.
+
+    They are named as it is, or they alone name no camera. RecordingError where several are left, or
+    none but those of other cameras.
+    """
+    own = [name for name in found if camera_of(name) == camera_of(depth)]
+    left = own or [name for name in found if not camera_of(name)]
+    if found and len(left) != 1:
+        refuse(path, f"has {', '.join(found)}: write what belongs to {depth} to --camera")
+    return left[0] if left else None
+
+
+def intrinsics_of(path: Path, name: str, intrinsics: np.ndarray, depth: np.ndarray) -> list[float]:
+    """fx, fy, cx, cy of four numbers or a matrix (3, 3), of the camera that saw `depth` (H, W).
+
+    RecordingError for what no such camera has: the principal point is near the image's middle.
+    """
     if intrinsics.size == 9:
-        intrinsics = intrinsics.reshape(3, 3)[[0, 1, 0, 1], [0, 1, 2, 2]]
+        matrix = intrinsics.reshape(3, 3)
+        if matrix[2].tolist() != [0, 0, 1]:
+            refuse(path, f"the last row of {name} is not 0, 0, 1: it may be transposed")
+        intrinsics = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
     numbers = [float(x) for x in intrinsics.ravel()]
     try:
         Camera(intrinsics=numbers)
     except ValueError as error:
         refuse(path, f"{name} holds no intrinsics; {error}")
+    H, W = depth.shape
+    cx, cy = numbers[2:]
+    if abs(cx - W / 2) >= W / 4 or abs(cy - H / 2) >= H / 4:
+        refuse(
+            path,
+            f"{name} has its principal point at {cx:g}, {cy:g}, far from the middle of the depth, "
+            f"{W} x {H}: if it is right, write fx, fy, cx, cy to --camera",
+        )
     return numbers
+
+
+def camera_pose(path: Path, name: str, extrinsics: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) of a camera whose extrinsics (3, 4) or (4, 4) lead from world to camera."""
+    if extrinsics.shape not in ((3, 4), (4, 4)):
+        refuse(path, f"{name} has the shape {extrinsics.shape}, where extrinsics have (3, 4)")
+    matrix = np.vstack([extrinsics[:3], [0, 0, 0, 1]]).astype(np.float64)
+    if not np.isfinite(matrix).all() or not is_pose(matrix):
+        refuse(path, f"{name} is no pose of a camera: its 3 x 3 must be a rotation")
+    return np.linalg.inv(matrix)
 
 
 UNITS = {"m": 1.0, "mm": 0.001}  # metres
@@ -346,6 +394,12 @@ def choose_array(
     refuse(path, f"{problem}; it holds {there}")
 
 
+def refuse_name_of_color(path: Path, options: Options) -> None:
+    """RecordingError for `--color NAME` where the points have colors of their own."""
+    if options.color:
+        refuse(path, "its colors stand in its points: write --color without a name")
+
+
 # ---- DP3's zarr ----------------------------------------------------------------------------------
 
 IN_ZARR = {
@@ -358,6 +412,7 @@ IN_ZARR = {
 
 def read_zarr(path: Path, options: Options) -> Source:
     """A replay buffer of DP3."""
+    refuse_name_of_color(path, options)
     arrays, unread = open_zarr(path)
     check_zarr(path, arrays)
     try:
@@ -522,7 +577,9 @@ class LeRobot:
             pictures = ", ".join(f"{n} ({self.features[n]['dtype']})" for n in sorted(colored))
             raise RecordingError(f"{error}{', and ' + pictures if pictures else ''}") from None
         self.color = self.intrinsics = None
-        if self.is_depth:
+        if not self.is_depth:
+            refuse_name_of_color(path, options)
+        else:
             self.intrinsics = self.choose_intrinsics()
             self.scale = self.read_scale()
             if self.is_video(self.cloud):
@@ -589,14 +646,9 @@ class LeRobot:
         if self.camera.intrinsics is not None:
             return None
         found = [name for name in self.features if "intrinsics" in name]
-        if len(found) > 1:
-            refuse(
-                self.path,
-                f"has the intrinsics {', '.join(found)}: write those of {self.cloud} to --camera",
-            )
         if not found:
             refuse(self.path, f"{self.cloud} needs the camera's {LENS}: write them to --camera")
-        return found[0]
+        return of_same_camera(self.path, self.cloud, found)
 
     def choose_color(self, colored: set[str], chosen: str) -> str:
         """The picture whose pixels are those of the depth."""
@@ -616,6 +668,15 @@ class LeRobot:
         except (OSError, ValueError) as error:  # those of pyarrow are among them
             refuse_damaged(file, error, "no parquet file")
 
+    def read_table(self, file: Path) -> Any:
+        """A whole table of meta/, but for the statistics in it."""
+        stored = self.open_parquet(file)
+        columns = [n for n in stored.schema_arrow.names if not n.startswith("stats/")]
+        try:
+            return stored.read(columns=columns)
+        except (OSError, ValueError) as error:
+            refuse_damaged(file, error, "no parquet file")
+
     def read_episodes(self) -> dict[int, dict[str, Any]]:
         """episode -> what meta/ says of it: its length, and where in the videos it stands."""
         rows = []
@@ -623,16 +684,14 @@ class LeRobot:
         if (meta / "episodes.jsonl").is_file():
             rows = read_all_json_lines(meta / "episodes.jsonl")
         for file in sorted((meta / "episodes").glob("*/*.parquet"), key=natural):
-            stored = self.open_parquet(file)
-            columns = [n for n in stored.schema_arrow.names if not n.startswith("stats/")]
-            rows += stored.read(columns=columns).to_pylist()
+            rows += self.read_table(file).to_pylist()
         return {row["episode_index"]: row for row in rows if type(row.get("episode_index")) is int}
 
     def read_tasks(self) -> dict[int, Any]:
         """task_index -> instruction."""
         meta = self.path / "meta"
         if (meta / "tasks.parquet").exists():  # 3.0: the tasks are the index of a table of pandas
-            table = self.open_parquet(meta / "tasks.parquet").read().to_pydict()
+            table = self.read_table(meta / "tasks.parquet").to_pydict()
             index = table.pop("task_index", None)
             texts = [n for n in ("task", "__index_level_0__") if n in table] or list(table)
             if index is None or len(texts) != 1:
@@ -719,7 +778,7 @@ class LeRobot:
             color = color_image(file, self.color, color, depth)
         intrinsics = self.camera.intrinsics
         if intrinsics is None:
-            intrinsics = intrinsics_of(file, self.intrinsics, row[self.intrinsics])
+            intrinsics = intrinsics_of(file, self.intrinsics, row[self.intrinsics], depth)
         return depth_cloud(depth, scale=self.scale, intrinsics=intrinsics, color=color)
 
 
@@ -822,23 +881,26 @@ HDF5_STATES = (  # of robomimic, LIBERO and ManiSkill; --state names others
 )
 
 
+OF_DAMAGED_HDF5 = (OSError, KeyError, RuntimeError, ValueError)  # what h5py raises
+
+
 def read_hdf5(path: Path, options: Options) -> Source:
     """Demonstrations of robomimic (data/demo_0 ...) or ManiSkill (traj_0 ...)."""
     h5py = package("h5py", path)
+    groups = {}
     try:
         file = h5py.File(path, "r")
-    except OSError as error:
+        parent = file["data"] if isinstance(file.get("data"), h5py.Group) else file
+        for name in parent:
+            number = re.fullmatch(r"(?:demo|traj|episode)_(\d+)", name)
+            if number and isinstance(parent.get(name), h5py.Group):
+                groups[int(number[1])] = parent[name]
+    except OF_DAMAGED_HDF5 as error:
         refuse_damaged(path, error, "no HDF5 file")
-    parent = file["data"] if isinstance(file.get("data"), h5py.Group) else file
-    groups = {}
-    for name in parent:
-        number = re.fullmatch(r"(?:demo|traj|episode)_(\d+)", name)
-        if number and isinstance(parent.get(name), h5py.Group):
-            groups[int(number[1])] = parent[name]
     groups = dict(sorted(groups.items()))
     if not groups:
         refuse(path, f"holds no data/demo_0 or traj_0; it holds {', '.join(file)}")
-    first = hdf5_arrays(next(iter(groups.values())))
+    first = hdf5_arrays(path, next(iter(groups.values())))
     if "actions" not in first:
         refuse(path, f"it lacks actions; an episode holds {', '.join(first)}")
     data = HDF5(path, first, options)
@@ -852,15 +914,18 @@ def read_hdf5(path: Path, options: Options) -> Source:
     )
 
 
-def hdf5_arrays(group: Any) -> dict[str, Any]:
-    """All arrays of numbers in a group, by their path."""
+def hdf5_arrays(path: Path, group: Any) -> dict[str, Any]:
+    """All arrays of numbers in a group of a file, by their path."""
     found = {}
 
     def visit(name: str, item: Any) -> None:
         if hasattr(item, "shape") and item.ndim > 0 and item.dtype.kind in "fiu":
             found[name] = item
 
-    group.visititems(visit)
+    try:
+        group.visititems(visit)
+    except OF_DAMAGED_HDF5 as error:
+        refuse_damaged(path, error, "no HDF5 file")
     return found
 
 
@@ -877,6 +942,8 @@ def hdf5_lengths(path: Path, groups: dict[int, Any]) -> dict[int, int]:
     beside = path.with_suffix(".json")
     if not lengths and beside.is_file():
         for row in read_json(beside).get("episodes", []):
+            if not isinstance(row, dict):
+                continue
             episode, length = row.get("episode_id"), row.get("elapsed_steps")
             if type(episode) is int and type(length) is int:
                 lengths[episode] = length
@@ -911,7 +978,9 @@ class HDF5:
         self.color = self.intrinsics = self.extrinsics = None
         shape = observed[self.cloud]
         has_color = not self.is_depth and shape[cloud_axis(shape)] >= 6  # in the points themselves
-        if options.color is not None and not has_color:
+        if has_color:
+            refuse_name_of_color(path, options)
+        elif options.color is not None:
             self.color = self.choose_color(pictures, options.color)
         if self.is_depth:
             self.scale = unit_in_metres(path, self.cloud, self.stated_unit(first), options.camera)
@@ -949,18 +1018,12 @@ class HDF5:
         ManiSkill has obs/sensor_data/CAMERA/depth and obs/sensor_param/CAMERA/intrinsic_cv.
         """
         found = [name for name in first if kind in name.rpartition("/")[2]]
-        camera = self.cloud.split("/")[-2]
-        own = [name for name in found if camera in name.split("/")]
-        if len(found) > 1 and len(own) != 1:
-            refuse(
-                self.path, f"has {', '.join(found)}: write what belongs to {self.cloud} to --camera"
-            )
-        return (own or found or [None])[0]
+        return of_same_camera(self.path, self.cloud, found)
 
     def frames(self, groups: dict[int, Any], instruction: str | None) -> Iterator[Frame]:
         """The frames of all episodes; an observation after the last action is left out."""
         for episode, group in groups.items():
-            arrays = hdf5_arrays(group)
+            arrays = hdf5_arrays(self.path, group)
             T = len(arrays["actions"]) if "actions" in arrays else 0
             for name in self.read - {None}:
                 if name not in arrays or len(arrays[name]) not in (T, T + 1):
@@ -970,7 +1033,7 @@ class HDF5:
             try:
                 action = arrays["actions"][:].reshape(T, -1)
                 parts = [arrays[name][:T].reshape(T, -1) for name in self.state]
-            except OSError as error:
+            except OF_DAMAGED_HDF5 as error:
                 refuse_damaged(self.path, error, "no HDF5 file")
             state = np.concatenate(parts, axis=1)
             for i in range(T):
@@ -990,7 +1053,7 @@ class HDF5:
         names = {self.cloud, self.color, self.intrinsics, self.extrinsics} - {None}
         try:
             row = {name: arrays[name][i] for name in names}
-        except OSError as error:
+        except OF_DAMAGED_HDF5 as error:
             refuse_damaged(self.path, error, "no HDF5 file")
         if not self.is_depth:
             return self.colored_cloud(row)
@@ -998,11 +1061,11 @@ class HDF5:
         color = pose = None
         if self.color is not None:
             color = color_image(self.path, self.color, row[self.color], depth)
-        if self.extrinsics is not None:  # from world to camera, (3, 4) or (4, 4)
-            pose = np.linalg.inv(np.vstack([row[self.extrinsics][:3], [0, 0, 0, 1]]))
+        if self.extrinsics is not None:  # from world to camera
+            pose = camera_pose(self.path, self.extrinsics, row[self.extrinsics])
         intrinsics = self.camera.intrinsics
         if intrinsics is None:
-            intrinsics = intrinsics_of(self.path, self.intrinsics, row[self.intrinsics])
+            intrinsics = intrinsics_of(self.path, self.intrinsics, row[self.intrinsics], depth)
         return depth_cloud(depth, scale=self.scale, intrinsics=intrinsics, color=color, pose=pose)
 
     def colored_cloud(self, row: dict[str, np.ndarray]) -> np.ndarray:
@@ -1280,7 +1343,7 @@ def add_frame(
     points = frame.cloud()  # (M, P)
     xyz = points[:, :3]
     seen = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
-    episode.left_out["points at NaN or 0, 0, 0"] += int((~seen).sum())
+    episode.left_out["points at NaN or at the origin"] += int((~seen).sum())
     points = options.camera.place(points[seen])
     kept = 3 if options.color is None else 6
     if points.shape[1] < kept:
@@ -1326,9 +1389,11 @@ def scale_colors(path: Path, episodes: list[Episode]) -> None:
             f"numbers 4 to 6 of its points reach from {low:g} to {high:g}, where colors reach from "
             "0 to 1 or 255: leave --color out",
         )
-    if high > 1:
-        for cloud in clouds:
+    for cloud in clouds:
+        if high > 1.5:  # of 255
             cloud[:, 3:] /= 255
+        else:  # of 1, which rounding may exceed
+            cloud[:, 3:] = cloud[:, 3:].clip(0, 1)
 
 
 def as_float16(path: Path, points: np.ndarray) -> np.ndarray:
@@ -1476,7 +1541,7 @@ def describe(
     left_out += notes
     return (
         f"wrote {file}: {len(recording)} episodes of {recording.instruction!r}, "
-        f"{', '.join(shapes)}; left out: {', '.join(left_out) or 'nothing'}"
+        f"{', '.join(shapes)}; left out: {'; '.join(left_out) or 'nothing'}"
     )
 
 

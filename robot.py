@@ -118,24 +118,34 @@ class Settings:
     num_points: int = setting(1024, "points of a cloud", least=1, most=100_000)
     policy_hz: float = setting(10.0, "observations and actions a second", least=1, most=30)
     servo_hz: float = setting(125.0, "poses a second", least=100, most=500)
-    max_speed_m_s: float = setting(0.25, "the arm is never faster", least=0.001, most=1.0)
-    max_speed_rad_s: float = setting(0.16, "nor turns faster", least=0.001, most=3.0)
-    max_step_m: float = setting(0.05, "a longer step is a jump, and stops", least=0.001, most=0.5)
-    max_step_rad: float = setting(0.2, "so is a larger turn", least=0.001, most=3.0)
-    max_state_age_s: float = setting(0.1, "an older state stops", least=0.01, most=1.0)
-    max_lag_m: float = setting(0.03, "a longer lag stops", least=0.001, most=0.5)
-    max_lag_rad: float = setting(0.2, "so does a larger angle", least=0.001, most=3.0)
-    max_hold_s: float = setting(2.0, "so long a late policy is waited for", least=0.01, most=60)
-    servo_lookahead_s: float = setting(0.1, "of servoj: smooths motion", least=0.03, most=0.2)
-    servo_gain: float = setting(300.0, "of servoj", least=100, most=2000)
+    max_speed_m_s: float = setting(0.25, "the TCP is never faster", least=0.001, most=1.0)
+    max_speed_rad_s: float = setting(0.16, "the TCP never turns faster", least=0.001, most=3.0)
+    max_step_m: float = setting(0.05, "a longer step is a jump, which stops", least=0.001, most=0.5)
+    max_step_rad: float = setting(0.2, "a larger turn in one step stops", least=0.001, most=3.0)
+    max_state_age_s: float = setting(
+        0.1, "an older state of the arm stops it", least=0.01, most=1.0
+    )
+    max_lag_m: float = setting(
+        0.03, "stops if the arm is farther from its target", least=0.001, most=0.5
+    )
+    max_lag_rad: float = setting(
+        0.2, "stops if it is turned farther from its target", least=0.001, most=3.0
+    )
+    max_hold_s: float = setting(
+        2.0, "stops if no new actions come for so long", least=0.01, most=60
+    )
+    servo_lookahead_s: float = setting(
+        0.1, "lookahead time of servoj, which smooths", least=0.03, most=0.2
+    )
+    servo_gain: float = setting(300.0, "gain of servoj", least=100, most=2000)
     gripper_serial: str | None = setting(None, "such as /dev/ttyUSB0; null: gripper_port of --host")
-    gripper_slave: int = setting(1, "Modbus address", least=1, most=247)
+    gripper_slave: int = setting(1, "Modbus address of the gripper", least=1, most=247)
     gripper_open_at: int = setting(1000, "per mille where it is open", choices=(0, 1000))
-    gripper_force_percent: int = setting(30, "of its force", least=20, most=100)
-    rtde_port: int = setting(30004, "RTDE", **PORT)
-    script_port: int = setting(30002, "the secondary interface", **PORT)
-    dashboard_port: int = setting(29999, "the dashboard server", **PORT)
-    gripper_port: int = setting(54321, "the serial bridge", **PORT)
+    gripper_force_percent: int = setting(30, "gripping force", least=20, most=100)
+    rtde_port: int = setting(30004, "port of RTDE", **PORT)
+    script_port: int = setting(30002, "port of the secondary interface", **PORT)
+    dashboard_port: int = setting(29999, "port of the dashboard server", **PORT)
+    gripper_port: int = setting(54321, "port of the gripper's serial bridge", **PORT)
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -160,6 +170,19 @@ class Settings:
             except RobotError as error:
                 self.refuse("start_pose", str(error))
 
+    @property
+    def lead(self) -> np.ndarray:
+        """How far a pose that is sent is ahead of the measured one at most, see `Servo`: (2,).
+
+        In metres and radians, as is `target_speed`, a second.
+        """
+        return np.array([self.max_speed_m_s, self.max_speed_rad_s]) * self.servo_lookahead_s
+
+    @property
+    def target_speed(self) -> np.ndarray:
+        """How fast targets move at most, (2,)."""
+        return self.lead / (self.servo_lookahead_s + STATE_DELAY)
+
     def refuse(self, name: str, why: str) -> None:
         raise ValueError(f"{name} in the robot's settings is {getattr(self, name)!r}: {why}")
 
@@ -169,7 +192,8 @@ class Settings:
             metres, radians = lengths(step)
             if metres > self.max_step_m or radians > self.max_step_rad:
                 raise RobotError(
-                    f"a step jumps by {metres:.3f} m, {radians:.3f} rad (max_step_m, max_step_rad)"
+                    f"a step jumps by {metres:.3f} m and {radians:.3f} rad, where max_step_m is "
+                    f"{self.max_step_m:g} and max_step_rad {self.max_step_rad:g}"
                 )
 
     def check_poses(self, poses: Sequence[np.ndarray]) -> None:
@@ -216,22 +240,17 @@ def check_value(
     types = {"int": {int}, "str": {str}}.get(kind.split(" ")[0], {int, float})
     array = np.array(value, dtype=object)
     if array.shape != shape or {type(x) for x in array.flat} - types:
-        count = " x ".join(map(str, shape)) or "1"
-        names = " or ".join(sorted(t.__name__ for t in types))
-        raise ValueError(f"give {count} of {names}")
+        what = {"int": "a whole number", "str": "text"}.get(kind.split(" ")[0], "a number")
+        count = " x ".join(map(str, shape))
+        raise ValueError(f"give {count} numbers" if count else f"give {what}")
     if choices and value not in choices:
         raise ValueError(f"use one of {choices}")
     if choices or types == {str}:
         return
     if not all(least <= x <= most for x in array.flat):
         raise ValueError(f"use {least} to {most}; lengths are in metres, angles in radians")
-    if rigid:
-        matrix = array.astype(float)
-        rotation = matrix[:3, :3]
-        orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-        mirrored = np.linalg.det(rotation) < 0
-        if not orthogonal or mirrored or matrix[3].tolist() != [0, 0, 0, 1]:
-            raise ValueError("its 3 x 3 must be a rotation, its last row 0 0 0 1")
+    if rigid and not is_pose(array.astype(float)):
+        raise ValueError("its 3 x 3 must be a rotation, its last row 0 0 0 1")
 
 
 def load_settings(path: str | Path) -> Settings:
@@ -508,6 +527,7 @@ class RTDE:
 
 # ---- The controller's program and its other ports ------------------------------------------------
 
+STATE_DELAY = 0.025  # seconds from measuring a pose to following the answer
 MISSING_PACKAGES = 10  # the watchdog waits for so many: 80 ms at 125 Hz
 
 # What runs on the controller. It ends when it is told to, when no inverse kinematics is found, or
@@ -702,7 +722,9 @@ class Gripper:
             deadline = time.monotonic() + timeout
             while self.exchange(READ, INITIALIZED, 1) != 1:
                 if time.monotonic() > deadline:
-                    raise RobotError(f"the gripper at {self.where} is not ready: {timeout:g} s")
+                    raise RobotError(
+                        f"the gripper at {self.where} is not ready after {timeout:g} s"
+                    )
                 time.sleep(0.05)
         self.exchange(WRITE, FORCE, self.settings.gripper_force_percent)
 
@@ -722,6 +744,13 @@ class Gripper:
 
 
 # ---- Camera: depth to points in the robot's base frame -------------------------------------------
+
+
+def is_pose(matrix: np.ndarray) -> bool:
+    """Whether a (4, 4) is a pose: a rotation, a translation, and a last row of 0, 0, 0, 1."""
+    rotation = matrix[:3, :3]
+    orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    return bool(orthogonal and np.linalg.det(rotation) > 0 and matrix[3].tolist() == [0, 0, 0, 1])
 
 
 def has_depth(depth: np.ndarray) -> np.ndarray:
@@ -978,12 +1007,11 @@ class Servo:
 
     An arm that follows `servoj` is behind by about its lookahead time. So no pose is sent that is
     farther ahead of the measured one than the arm may go in that time: an arm that was held back
-    by force, and is let go, is then not faster than allowed. The measured pose is `DELAY` old, so
-    that targets move at lookahead / (lookahead + DELAY) of the arm's greatest speed: at 80 % of it
-    where the lookahead time is 0.1 s.
+    by force, and is let go, is then not faster than allowed. The measured pose is `STATE_DELAY`
+    old, so that targets move at lookahead / (lookahead + STATE_DELAY) of the arm's greatest speed:
+    at 80 % of it where the lookahead time is 0.1 s.
     """
 
-    DELAY = 0.025  # seconds from measuring a pose to following the answer
     PATIENCE = 5.0  # seconds for the program to start
     REACHED = 1e-6  # metres and radians: a target that is nearer has been reached
     STANDS = 1e-7  # metres and radians: a step of the slowest arm allowed is ten times as long
@@ -1005,10 +1033,7 @@ class Servo:
 
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
         self.sent = self.pose  # sent last: ahead of the measured pose by no more than `lead`
-        fastest = np.array([settings.max_speed_m_s, settings.max_speed_rad_s])
-        lookahead = settings.servo_lookahead_s
-        self.lead = fastest * lookahead  # (2,) metres, radians
-        self.speed = self.lead / (lookahead + self.DELAY)  # (2,) a second, of the targets
+        self.lead, self.speed = settings.lead, settings.target_speed
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
         self.broken_off = False  # targets were left out, by `hold`
         self.held_since = time.monotonic()
@@ -1062,7 +1087,8 @@ class Servo:
             self.settings.check_poses([state.pose])
         if time.monotonic() > deadline:
             raise RobotError(
-                f"its program does not start: remote control?{self.rtde.controller_said}"
+                f"its program has not started within {self.PATIENCE:g} s: is the robot in remote "
+                f"control, and the secondary interface allowed?{self.rtde.controller_said}"
             )
         if self.moves and not uploaded and state.values["robot_status_bits"] & PROGRAM_RUNNING:
             raise RobotError("another program runs there, stop it first")
@@ -1098,6 +1124,12 @@ class Servo:
         except RobotError as error:
             self.fail(str(error))
         self.check()
+
+    def begin_here(self) -> None:
+        """Lets the next actions begin where the arm is, which a dry run does not move."""
+        with self.lock:
+            self.pose = self.rtde.state(self.settings.max_state_age_s).pose
+            self.targets = []
 
     def hold(self) -> None:
         """Holds the arm where it is now: the targets that it has not reached are left out."""
@@ -1503,12 +1535,16 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
     common.pick_device(args.device)
     policy, info = model.load(args.checkpoint, args.device, needs=("text_weights",))
     config = policy.config
-    needed = (config.state_dim, config.action_dim, config.num_points)
-    if needed[:2] != (STATE_DIM, ACTION_DIM) or config.num_points > settings.num_points:
+    if (config.state_dim, config.action_dim) != (STATE_DIM, ACTION_DIM):
         raise UserError(
-            f"{args.checkpoint} has {needed} dimensions of state and action, and points, the robot "
-            f"{(STATE_DIM, ACTION_DIM, settings.num_points)}: use a policy trained on its "
-            "recordings"
+            f"{args.checkpoint} has states of {config.state_dim} and actions of "
+            f"{config.action_dim} numbers, this robot {STATE_DIM} and {ACTION_DIM}: use a policy "
+            "trained on its recordings"
+        )
+    if config.num_points > settings.num_points:
+        raise UserError(
+            f"{args.checkpoint} reads {config.num_points} points, num_points of the settings is "
+            f"{settings.num_points}: raise it"
         )
     recording = data.load_demonstrations(args.data)
     task = info.get("adapted_to", recording.task)
@@ -1540,7 +1576,39 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
             raise RobotError(f"the policy failed: {error!r}") from error
         return actions[0].cpu().numpy()
 
+    warm_up(policy, context, settings, args.device)
     drive(args, settings, recording, act=act, start=settings.start_pose)
+
+
+def warm_up(policy: model.DAMIPolicy, context: Any, settings: Settings, device: str) -> None:
+    """Draws two chunks before an arm waits for them: on a GPU the first may take seconds.
+
+    Raises UserError if the second takes longer than the arm may wait.
+    """
+    config = policy.config
+    points = torch.zeros(1, config.n_obs_steps, config.num_points, 3, device=device)
+    state = torch.zeros(1, config.n_obs_steps, config.state_dim, device=device)
+    for _ in range(2):
+        began = time.monotonic()
+        policy.sample_actions(points, state, context, torch.Generator().manual_seed(0)).cpu()
+        seconds = time.monotonic() - began
+    if seconds > settings.max_hold_s:
+        raise UserError(
+            f"the policy takes {seconds:.1f} s for a chunk, and max_hold_s is "
+            f"{settings.max_hold_s:g}: use a faster computer or a smaller policy"
+        )
+
+
+def at_allowed_speed(actions: np.ndarray, settings: Settings) -> np.ndarray:
+    """Divides each action (T, 7) that is faster than targets may move into equal parts, (n, 7).
+
+    The way remains the same, and the gripper's place on it; only the time is longer.
+    """
+    parts = np.ceil((lengths(actions) * settings.policy_hz / settings.target_speed).max(axis=1))
+    parts = parts.clip(1).astype(int)  # (T,)
+    divided = actions.copy()
+    divided[:, :6] /= parts[:, None]
+    return np.repeat(divided, parts, axis=0)
 
 
 def replay(args: argparse.Namespace, settings: Settings) -> None:
@@ -1552,7 +1620,13 @@ def replay(args: argparse.Namespace, settings: Settings) -> None:
     if not 0 <= args.episode < len(recording):
         raise UserError(f"{args.data} has {len(recording)} episodes: no --episode {args.episode}")
     frames = recording.episode(args.episode)
-    actions = recording.action[frames]  # (T, A)
+    recorded = recording.action[frames]  # (T, A)
+    actions = at_allowed_speed(recorded, settings)
+    if len(actions) > len(recorded):
+        print(
+            f"{len(recorded)} actions take the time of {len(actions)}: some were faster than the "
+            "arm may go"
+        )
     chunks = iter(np.array_split(actions, math.ceil(len(actions) / 8)))
     start = recording.state[frames.start, :6].tolist()
     drive(args, settings, recording, act=lambda _: next(chunks, None), start=start)
@@ -1611,15 +1685,19 @@ def drive(
         try:
             cell.prepare(servo)
             servo.start(args.host)
-            if start is not None:
-                servo.go(np.array(start))
             print(f"{recording.task}: {args.command}; Ctrl-C stops", flush=True)
+            if start is not None:
+                metres, radians = distance(servo.pose, np.array(start))
+                print(f"going to the start, {metres:.2f} m and {radians:.2f} rad away", flush=True)
+                servo.go(np.array(start))
             log.frames.append(cell.observe(servo))
             while True:
                 with cell.activity.during("computing actions"):
                     chunk = act(log.frames)
                 if chunk is None:
                     break
+                if args.dry_run and args.command == "run":
+                    servo.begin_here()  # the policy sees that the arm has not moved
                 execute(chunk, cell, servo, log)
                 if servo.broken_off and args.command == "replay":
                     raise RobotError("camera or gripper were late: the rest would begin elsewhere")
@@ -1792,19 +1870,32 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
     out = Path(args.out or f"demos/{args.task}.npz")
     if out.exists() and not args.append:
         raise UserError(f"{out} exists: add --append, move it, or give another --out")
-    kept = data.load_demonstrations(out) if out.exists() else None
-    if kept and (kept.task, kept.instruction) != (args.task, args.instruction):
-        raise UserError(f"{out} holds {kept.task}, {kept.instruction!r}: use another --out")
-    if kept and kept.points.shape[1] != settings.num_points:
-        n = kept.points.shape[1]
-        raise UserError(f"{out} has clouds of {n} points: set num_points so, or use another --out")
+    with common.locked(out.parent):
+        kept = data.load_demonstrations(out) if out.exists() else None
+        if kept and (kept.task, kept.instruction) != (args.task, args.instruction):
+            raise UserError(f"{out} holds {kept.task}, {kept.instruction!r}: use another --out")
+        if kept and kept.points.shape[1] != settings.num_points:
+            n = kept.points.shape[1]
+            raise UserError(
+                f"{out} has clouds of {n} points: set num_points so, or use another --out"
+            )
+        record_episodes(args, settings, out, kept)
+
+
+def record_episodes(
+    args: argparse.Namespace, settings: Settings, out: Path, kept: Demonstrations | None
+) -> None:
+    """`record`, behind the episodes that the file holds already."""
     moves = not args.dry_run
-    with common.locked(out.parent), connect(args, settings, write=moves) as cell, Keys() as keys:
+    with connect(args, settings, write=moves) as cell, Keys() as keys:
         meta = {**cell.made_with(kept), "made_by": "robot.record", "camera": args.camera}
         servo = Servo(cell.rtde, settings, moves=moves, free=True, activity=cell.activity)
         cell.prepare(servo)
         recorder = Recorder(args=args, cell=cell, out=out, meta=meta, kept=kept)
-        recorder.closed = float(cell.gripper.read() > 0.5)
+        closed = cell.gripper.read()
+        if moves and 0.1 < closed < 0.9:
+            raise UserError(f"the gripper is half open ({closed:.2f}): open or close it first")
+        recorder.closed = float(closed > 0.5)
         try:
             servo.start(args.host)
             print("keys: s starts an episode, e ends and keeps it, d drops it, ", end="")

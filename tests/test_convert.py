@@ -21,7 +21,7 @@ import zarr
 from conftest import fails
 
 import convert
-from data import Demonstrations, load_demonstrations, save_demonstrations
+from data import Demonstrations, RecordingError, load_demonstrations, save_demonstrations
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 RNG = np.random.default_rng(0)
@@ -199,7 +199,10 @@ def test_points_that_were_not_seen_are_left_out_and_counted(capsys):
     buffer("stir.zarr", data__point_cloud=cloud)
     convert.main(["--import", "stir.zarr", *SAY, "--num-points", "30"])
     printed = capsys.readouterr().out
-    assert "left out: 33 points at NaN or 0, 0, 0, 1 empty clouds, in whose place stands" in printed
+    assert (
+        "left out: 33 points at NaN or at the origin; 1 empty clouds, in whose place stands"
+        in printed
+    )
     points = load_demonstrations("recordings/stir-the-soup.npz").points
     assert np.isfinite(points).all() and (points != 0).any(axis=-1).all()
     np.testing.assert_array_equal(points[7], points[6])
@@ -228,6 +231,12 @@ def test_colors_are_kept_from_0_to_1(largest, capsys):
 def test_what_is_no_color_is_not_kept_as_one(cloud, message, capsys):
     buffer("stir.zarr", data__point_cloud=cloud)
     assert message in fails(convert, ["--import", "stir.zarr", *SAY, "--color"], capsys)
+
+
+def test_a_name_of_a_color_that_is_not_read_is_refused(capsys):
+    buffer("stir.zarr", data__point_cloud=RNG.uniform(0, 1, (20, 30, 6)).astype(np.float32))
+    message = fails(convert, ["--import", "stir.zarr", *SAY, "--color", "data/img"], capsys)
+    assert "its colors stand in its points: write --color without a name" in message
 
 
 def test_an_episode_can_be_left_out(capsys):
@@ -601,7 +610,7 @@ def test_what_there_is_of_an_incomplete_dataset_is_imported_where_that_is_asked_
     in_data(rows=range(13))()
     convert.main("--import kitchen --incomplete".split())
     printed = capsys.readouterr().out
-    assert "left out: what is missing (of 3 episodes 1 are missing (2)), 1 arrays" in printed
+    assert "left out: what is missing (of 3 episodes 1 are missing (2)); 1 arrays" in printed
     assert load_demonstrations("recordings/stir-the-soup.npz").episode_ends.tolist() == [8]
 
 
@@ -683,11 +692,51 @@ def test_of_two_lenses_none_is_guessed_and_the_file_of_the_camera_comes_first(ca
     lenses = {f"{side}.intrinsics": np.tile(np.float32(LENS), (20, 1)) for side in ("left", "top")}
     dataset("kitchen", seen=DEPTH, info=MILLIMETRES, **{DEPTH: depth}, **lenses)
     message = fails(convert, ["--import", "kitchen"], capsys)
-    assert "has the intrinsics left.intrinsics, top.intrinsics" in message
+    assert "has left.intrinsics, top.intrinsics: write what belongs to" in message
     Path("camera.json").write_text(json.dumps({"intrinsics": [80.0, 50.0, 8.0, 6.0]}))
     convert.main("--import kitchen --num-points 192 --camera camera.json".split())
     found = load_demonstrations("recordings/pour-the-tea.npz").points
     assert found[..., 0].max() == pytest.approx((15 - 8) / 80 * 2, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "depth, found, own",
+    [
+        ("obs/front_depth", ["obs/front_intrinsics", "obs/wrist_intrinsics"], 0),
+        ("obs/front_depth", ["obs/wrist_intrinsics"], None),
+        ("obs/front_depth", ["obs/intrinsics"], 0),
+        ("obs/front_depth", ["obs/color_intrinsics"], None),
+        ("obs/depth", ["obs/camera_intrinsics", "obs/wrist_intrinsics"], 0),
+        ("obs/sensor_data/hand_camera/depth", ["obs/sensor_param/base_camera/intrinsic_cv"], None),
+        ("obs/sensor_data/hand_camera/depth", ["obs/sensor_param/hand_camera/intrinsic_cv"], 0),
+        ("observation.depth", ["left.intrinsics", "top.intrinsics"], None),
+        ("observation.left_wrist.depth", ["left.intrinsics", "left_wrist.intrinsics"], 1),
+    ],
+)
+def test_intrinsics_are_those_of_the_depths_camera_by_its_name(depth, found, own):
+    if own is None:
+        with pytest.raises(RecordingError, match="write what belongs to"):
+            convert.of_same_camera("demo", depth, found)
+    else:
+        assert convert.of_same_camera("demo", depth, found) == found[own]
+    assert convert.of_same_camera("demo", depth, []) is None
+
+
+@pytest.mark.parametrize(
+    "lens, message",
+    [
+        (np.transpose(MATRIX), "is not 0, 0, 1: it may be transposed"),
+        ([40.0, 50.0, 16.0, 12.0], "principal point at 16, 12, far from the middle"),
+    ],
+)
+def test_intrinsics_that_cannot_be_of_the_depth_are_refused(lens, message, capsys):
+    lens = np.array(lens, np.float32)
+    more = {
+        DEPTH: one_pixel(2000),
+        "observation.intrinsics": np.broadcast_to(lens, (20, *lens.shape)),
+    }
+    dataset("kitchen", seen=DEPTH, info=MILLIMETRES, **more)
+    assert message in fails(convert, ["--import", "kitchen"], capsys)
 
 
 def test_pose_and_crop_box_of_the_camera_hold_for_clouds_too():
@@ -1019,13 +1068,48 @@ def test_depth_of_maniskill_is_seen_by_its_own_camera():
     np.testing.assert_allclose(found.points[0, 0], [0.5 - y, x, z + 0.1], rtol=2e-3)
 
 
+@pytest.mark.parametrize("extrinsics", [np.zeros((3, 4)), np.ones(16), np.full((4, 4), np.nan)])
+def test_extrinsics_that_are_no_pose_are_refused(extrinsics, capsys):
+    seen = {
+        "sensor_data/front/depth": one_pixel(700, np.int16)[0][..., None],
+        "sensor_param/front/intrinsic_cv": np.float32(MATRIX),
+        "sensor_param/front/extrinsic_cv": np.float32(extrinsics),
+    }
+    maniskill("demo.h5", seen)
+    message = fails(convert, ["--import", "demo.h5", *SAY, "--depth-unit", "mm"], capsys)
+    assert "extrinsic_cv" in message
+
+
+def test_an_hdf5_file_with_any_damaged_byte_is_read_or_refused(capsys):
+    """Where something is wrong with its structure, h5py raises errors of several kinds."""
+    maniskill("demo.h5", {"pointcloud/xyzw": RNG.normal(size=(30, 4)).astype(np.float32)})
+    whole = Path("demo.h5").read_bytes()
+    refused = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        damaged = bytearray(whole)
+        for place in rng.integers(len(whole), size=20):
+            damaged[place] = rng.integers(256)
+        Path("demo.h5").write_bytes(damaged)
+        try:
+            convert.main(
+                ["--import", "demo.h5", *SAY, "--num-points", "20", "--out", f"own-{seed}"]
+            )
+        except RecordingError:
+            refused += 1
+    assert refused > 5
+
+
 def test_points_that_maniskill_did_not_see_are_left_out(capsys):
     cloud = np.append(RNG.uniform(0.1, 1, (30, 3)), np.ones((30, 1)), axis=1).astype(np.float32)
     cloud[:10, 3] = 0
     color = np.full((30, 3), 255, np.uint8)
     maniskill("demo.h5", {"pointcloud/xyzw": cloud, "pointcloud/rgb": color})
     convert.main(["--import", "demo.h5", *SAY, "--num-points", "20", "--color"])
-    assert "left out: 80 points at NaN or 0, 0, 0, 1 observation after" in capsys.readouterr().out
+    assert (
+        "left out: 80 points at NaN or at the origin; 1 observation after"
+        in capsys.readouterr().out
+    )
     found = load_demonstrations("recordings/stir-the-soup.npz").points
     assert {tuple(p) for p in found[3, :, :3]} == {tuple(p) for p in np.float16(cloud[10:, :3])}
     assert (found[..., 3:] == 1).all()

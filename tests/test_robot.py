@@ -569,7 +569,7 @@ def test_a_robot_in_trouble_is_not_moved_at_all(emulator, settings, monkeypatch)
     assert emulator.received == []
     emulator.faults.safety_mode, emulator.faults.no_program = 1, True
     monkeypatch.setattr(Servo, "PATIENCE", 0.3)
-    assert_refused("does not start")
+    assert_refused("has not started within")
     (program,) = emulator.programs
     assert "servoj(get_inverse_kin(pose, get_actual_joint_positions()), t=0.0080, " in program
     emulator.faults.no_program = False
@@ -664,7 +664,7 @@ def test_a_program_that_is_not_ours_is_not_followed_by_more_targets(
     emulator.faults.no_program = True
     emulator.outputs["output_int_register_24"] = 1
     monkeypatch.setattr(Servo, "PATIENCE", 0.3)
-    with pytest.raises(RobotError, match="does not start"):
+    with pytest.raises(RobotError, match="has not started within"):
         Moving(settings).__enter__()
 
 
@@ -1081,35 +1081,35 @@ def test_frames_without_depth_are_no_traceback():
     "changes, message",
     [
         ({"tcp_low_m": [0.5, -0.9, 0.05]}, "must be below that of tcp_high_m"),
-        ({"crop_low_m": [0, 0]}, "give 3 of float or int"),
-        ({"crop_low_m": [0, "0", 0]}, "give 3 of float or int"),
-        ({"crop_low_m": [0, True, 0]}, "give 3 of float or int"),
-        ({"tcp_high_m": None}, "give 3 of float or int"),
+        ({"crop_low_m": [0, 0]}, "give 3 numbers"),
+        ({"crop_low_m": [0, "0", 0]}, "give 3 numbers"),
+        ({"crop_low_m": [0, True, 0]}, "give 3 numbers"),
+        ({"tcp_high_m": None}, "give 3 numbers"),
         ({"tcp_low_m": [-600, -900, 50]}, "use -5"),  # millimetres
         ({"rotation_near_rad": [0, 180, 0]}, "use -5"),  # degrees
-        ({"start_pose": [0, 0, 0.3]}, "give 6 of float or int"),
+        ({"start_pose": [0, 0, 0.3]}, "give 6 numbers"),
         ({"start_pose": [-0.2, -0.5, 0.9, 0, 3, 0]}, "start_pose .*outside its box"),
         ({"camera_to_base": [[1, 0, 0, 0]] * 4}, "must be a rotation"),
-        ({"camera_to_base": [[1, 0, 0, 0]] * 3}, "give 4 x 4 of float or int"),
-        ({"camera_to_base": [[1, 0, 0, 0], [1]] * 2}, "give 4 x 4 of float or int"),
+        ({"camera_to_base": [[1, 0, 0, 0]] * 3}, "give 4 x 4 numbers"),
+        ({"camera_to_base": [[1, 0, 0, 0], [1]] * 2}, "give 4 x 4 numbers"),
         ({"max_speed": 1.0}, "unexpected keyword argument 'max_speed'"),
         ({"max_speed_m_s": 5.0}, "max_speed_m_s .* to 1"),
-        ({"max_speed_m_s": True}, "give 1 of float or int"),
-        ({"max_speed_m_s": "fast"}, "give 1 of float or int"),
+        ({"max_speed_m_s": True}, "give a number"),
+        ({"max_speed_m_s": "fast"}, "give a number"),
         ({"max_speed_m_s": float("nan")}, "use 0.001 to"),
         ({"max_speed_rad_s": 9}, "to 3"),  # degrees
         ({"max_step_m": 50}, "to 0.5"),
         ({"servo_hz": 5}, "servo_hz .*use 100"),  # a watchdog of 0.5 Hz
         ({"servo_gain": 5}, "100 to 2000"),
-        ({"num_points": 64.0}, "give 1 of int"),
-        ({"num_points": True}, "give 1 of int"),
+        ({"num_points": 64.0}, "give a whole number"),
+        ({"num_points": True}, "give a whole number"),
         ({"servo_lookahead_s": 0.2}, "max_lag_m .*the arm lags by 0.050"),
         ({"max_speed_rad_s": 2.0}, "max_lag_rad .*the arm lags by 0.200"),
         ({"outside_box": "ignore"}, "'stop', 'clamp'"),
-        ({"outside_box": ["stop"]}, "give 1 of str"),
+        ({"outside_box": ["stop"]}, "give text"),
         ({"gripper_open_at": 500}, "0, 1000"),
         ({"gripper_slave": 0}, "1 to 247"),
-        ({"gripper_serial": 7}, "give 1 of str"),
+        ({"gripper_serial": 7}, "give text"),
     ],
 )
 def test_wrong_settings_are_refused_in_one_line(tmp_path, changes, message):
@@ -1557,6 +1557,7 @@ def trained(tmp_path_factory):
 def running(cell, trained, monkeypatch):
     """Arguments of `run`, with a checkpoint and demonstrations."""
     monkeypatch.setattr(clip, "load_clip_text_encoder", load_once)
+    monkeypatch.setattr(robot, "warm_up", lambda *_: None)  # so that tests count what is executed
     for name in ("policy.pt", "demos.npz"):
         shutil.copy(trained / name, name)
     return ["run", *cell, *RUN]
@@ -1666,6 +1667,39 @@ def test_a_recorded_episode_is_replayed_from_where_it_began(emulator, settings, 
     assert "has (7, 4) dimensions of state and action" in capsys.readouterr().err
 
 
+def test_actions_that_are_too_fast_are_replayed_in_more_time(settings):
+    actions = np.concatenate([steps(2, dx=0.03, drz=-0.002), steps(1, dy=0.001, gripper=1.0)])
+    parts = robot.at_allowed_speed(actions, replace(settings, policy_hz=10.0))
+    metres, radians = robot.lengths(parts).max(axis=0) * 10.0
+    assert metres <= settings.target_speed[0] and radians <= settings.target_speed[1]
+    assert len(parts) == 5 and parts[-1].tolist() == actions[-1].tolist()  # 0.3 m/s of 0.2 allowed
+    np.testing.assert_allclose(parts[:, :6].sum(axis=0), actions[:, :6].sum(axis=0))
+
+
+def test_a_dry_run_begins_each_chunk_where_the_arm_is(emulator, running, monkeypatch, capsys):
+    """Otherwise the motion that is never made would add up, and leave the box."""
+
+    def sample(policy, points, state, context, generator):
+        chunk = torch.zeros(1, 8, 7)
+        chunk[..., 0] = 0.008
+        return chunk
+
+    monkeypatch.setattr(model.DAMIPolicy, "sample_actions", sample)
+    content = json.loads(Path("robot.json").read_text())
+    high = [START_POSE[0] + 0.1, *content["tcp_high_m"][1:]]  # two chunks of 6.4 cm lead out of it
+    Path("robot.json").write_text(json.dumps(content | {"tcp_high_m": high}))
+    assert ends([*running, "--seconds", "1.5", "--dry-run"]) == 0, capsys.readouterr().err
+    np.testing.assert_allclose(emulator.pose, START_POSE, atol=1e-6)
+
+
+def test_nothing_is_recorded_with_a_gripper_that_is_half_open(emulator, cell, capsys):
+    emulator.registers[0x0200] = 1  # initialized before
+    emulator.registers[0x0103] = emulator.opening = 550
+    argv = "--task stack --instruction Stack. --episodes 1".split()
+    assert ends(["record", *cell, *argv]) == 2
+    assert "the gripper is half open (0.45): open or close it first" in capsys.readouterr().err
+
+
 def test_actions_that_are_cut_short_are_told(emulator, settings, capsys):
     with Moving(settings) as servo:
         servo.follow(steps(drz=0.05))
@@ -1690,6 +1724,21 @@ def test_a_robot_or_device_that_does_not_fit_is_refused(
     Path("robot.json").write_text(json.dumps(content | changes))
     assert ends([*running, *arguments]) == 2
     assert message in capsys.readouterr().err and emulator.received == []
+
+
+def test_a_policy_that_is_too_slow_is_refused_before_the_arm_waits_for_it(settings, monkeypatch):
+    took = iter([0.3, 0.0, 0.3, 0.3])
+
+    def slow(policy, points, state, context, generator):
+        time.sleep(next(took))
+        return torch.zeros(len(points), 8, 7)
+
+    policy = model.DAMIPolicy(replace(model.PRESETS["tiny"], state_dim=7, action_dim=7))
+    monkeypatch.setattr(model.DAMIPolicy, "sample_actions", slow)
+    patient = replace(settings, max_hold_s=0.2)
+    robot.warm_up(policy, None, patient, "cpu")  # the first chunk may be slow
+    with pytest.raises(common.UserError, match="for a chunk, and max_hold_s is 0"):
+        robot.warm_up(policy, None, patient, "cpu")
 
 
 def test_an_error_of_the_policy_stops_the_arm(emulator, running, monkeypatch, capsys):
@@ -1844,7 +1893,7 @@ def test_a_policy_that_does_not_fit_the_robot_is_refused_before_connecting(cell,
     content = BOXES | {"num_points": 64, "rtde_port": 1}  # nobody listens there
     Path("robot.json").write_text(json.dumps(content))
     assert ends(["run", *cell, *RUN]) == 2
-    assert "points, the robot (7, 7, 64)" in capsys.readouterr().err
+    assert "reads 128 points, num_points of the settings is 64: raise it" in capsys.readouterr().err
     policy, info = model.load("policy.pt")
     model.save("other.pt", policy, **info, adapted_to="pour-tea")
     Path("robot.json").write_text(json.dumps(content | {"num_points": 128}))
