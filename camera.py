@@ -110,11 +110,12 @@ class RayCastCamera:
             default the world itself, to which floors belong.
         groups: of the geoms and sites that are seen, 0 to 5.
         sites: whether sites are seen. Goals are often drawn as sites.
+        hidden_sites: names or indices of sites that are not.
         ellipsoids: names or indices of bodies whose exact shape does not matter: in clouds, though
             not in `depth` and `render`, their meshes are ellipsoids. Meshes take most of the time.
 
     Raises:
-        KeyError, IndexError: the model has no such camera or body.
+        KeyError, IndexError: the model has no such camera, body or site.
         ValueError: not exactly one of `camera` and `position` with `lookat` is given; the camera is
             orthographic, or has a lens of its own (`sensorsize`); the box is empty; or a flex or a
             skin would be drawn, which rays do not meet.
@@ -133,6 +134,7 @@ class RayCastCamera:
         background: Sequence[str | int] = ("world",),
         groups: Sequence[int] = (0, 1, 2),
         sites: bool = True,
+        hidden_sites: Sequence[str | int] = (),
         ellipsoids: Sequence[str | int] = (),
     ):
         self.height, self.width = height, width
@@ -179,7 +181,9 @@ class RayCastCamera:
         self.cloud_types[meshes & geoms_of(model, ellipsoids)] = ellipsoid
 
         # Rays do not meet sites, so that a second model has a geom for each one that is seen.
-        self.sites = np.flatnonzero(site_colors[:, 3] > 0) if sites else np.zeros(0, dtype=int)
+        seen_sites = (site_colors[:, 3] > 0) & sites  # (sites,) bool
+        seen_sites[[model.site(site).id for site in hidden_sites]] = False
+        self.sites = np.flatnonzero(seen_sites)
         spec = mujoco.MjSpec()
         for site in self.sites:
             spec.worldbody.add_geom(type=mujoco.mjtGeom(model.site_type[site]), size=(1, 1, 1))

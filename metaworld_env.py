@@ -198,21 +198,16 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         (low, *_), (high, *_) = WORKSPACE
         wide = 2 * model.geom_size[:, 0] >= high - low
 
-        # The camera does not see what is transparent when it is made.
-        colors = model.site_rgba.copy()
-        hidden = [site for site in range(model.nsite) if model.site(site).name in hidden_sites]
-        model.site_rgba[hidden, 3] = 0
-        camera = RayCastCamera(
+        return RayCastCamera(
             model,
             CAMERA,
             height=pixels,
             width=pixels,
             box=WORKSPACE,
             background=np.unique(model.geom_bodyid[wide]),
+            hidden_sites=[i for i in range(model.nsite) if model.site(i).name in hidden_sites],
             ellipsoids=ARM_LINKS,
         )
-        model.site_rgba[:] = colors
-        return camera
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """Begins an episode; without a seed one is drawn. Returns (observation, info)."""

@@ -290,6 +290,7 @@ def test_a_site_looks_like_a_geom_of_its_shape_unless_sites_are_not_to_be_seen(s
     np.testing.assert_array_equal(depth, RayCastCamera(geom_model, "down").depth(geom_data))
     assert np.isfinite(depth).sum() > 50
     assert np.isinf(RayCastCamera(model, "down", sites=False).depth(data)).all()
+    assert np.isinf(RayCastCamera(model, "down", hidden_sites=[0]).depth(data)).all()
 
 
 def test_only_meshes_become_ellipsoids():
