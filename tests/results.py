@@ -864,7 +864,7 @@ def plot_steps(results: Results, skill: str, path: Path) -> None:
             label = "with a demonstration as input, no step"
             axes.axhline(np.mean(shown), color="gray", linestyle="--", label=label)
         axes.set_xticks(range(len(columns)), [str(n) for n in columns])
-        axes.set(xlabel=title, ylim=(-3, 103))
+        axes.set(xlabel=title, xlim=(-0.4, len(columns) - 0.6), ylim=(-3, 103))
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel(f"success at the end, {skill}, %")
     handles, labels = panels[0].get_legend_handles_labels()
