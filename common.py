@@ -387,7 +387,12 @@ class StopRequest:
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """Restores the previous handlers inside, for long work that has nothing to save."""
+        """Restores the previous handlers inside, for long work that has nothing to save.
+
+        Raises KeyboardInterrupt if a stop was requested before.
+        """
+        if self.requested:
+            raise KeyboardInterrupt
         self.__exit__()
         try:
             yield

@@ -299,8 +299,8 @@ def camera_of(name: str) -> set[str]:
 def of_same_camera(path: Path, depth: str, found: list[str]) -> str | None:
     """Which of the intrinsics or extrinsics `found` are of the camera of the depth.
 
-    They are named as it is, or they alone name no camera. RecordingError where several are left, or
-    none but those of other cameras.
+    Those whose name says the same camera as the depth's; if there are none, those whose name says
+    no camera. RecordingError unless one is left, or nothing was found.
     """
     own = [name for name in found if camera_of(name) == camera_of(depth)]
     left = own or [name for name in found if not camera_of(name)]
@@ -312,7 +312,7 @@ def of_same_camera(path: Path, depth: str, found: list[str]) -> str | None:
 def intrinsics_of(path: Path, name: str, intrinsics: np.ndarray, depth: np.ndarray) -> list[float]:
     """fx, fy, cx, cy of four numbers or a matrix (3, 3), of the camera that saw `depth` (H, W).
 
-    RecordingError for what no such camera has: the principal point is near the image's middle.
+    RecordingError if they are no intrinsics, or the principal point is far from the image's middle.
     """
     if intrinsics.size == 9:
         matrix = intrinsics.reshape(3, 3)
@@ -339,9 +339,15 @@ def camera_pose(path: Path, name: str, extrinsics: np.ndarray) -> np.ndarray:
     """The pose (4, 4) of a camera whose extrinsics (3, 4) or (4, 4) lead from world to camera."""
     if extrinsics.shape not in ((3, 4), (4, 4)):
         refuse(path, f"{name} has the shape {extrinsics.shape}, where extrinsics have (3, 4)")
-    matrix = np.vstack([extrinsics[:3], [0, 0, 0, 1]]).astype(np.float64)
+    if len(extrinsics) == 3:
+        extrinsics = np.vstack([extrinsics, [0, 0, 0, 1]])
+    matrix = extrinsics.astype(np.float64)
     if not np.isfinite(matrix).all() or not is_pose(matrix):
-        refuse(path, f"{name} is no pose of a camera: its 3 x 3 must be a rotation")
+        refuse(
+            path,
+            f"{name} is no pose of a camera: its 3 x 3 must be a rotation, its last row 0 0 0 1 "
+            "(it may be transposed)",
+        )
     return np.linalg.inv(matrix)
 
 
@@ -397,7 +403,11 @@ def choose_array(
 def refuse_name_of_color(path: Path, options: Options) -> None:
     """RecordingError for `--color NAME` where the points have colors of their own."""
     if options.color:
-        refuse(path, "its colors stand in its points: write --color without a name")
+        refuse(
+            path,
+            "a color is named where points have none beside them: write --color alone if they have "
+            "six numbers, or leave it out",
+        )
 
 
 # ---- DP3's zarr ----------------------------------------------------------------------------------
@@ -412,9 +422,9 @@ IN_ZARR = {
 
 def read_zarr(path: Path, options: Options) -> Source:
     """A replay buffer of DP3."""
-    refuse_name_of_color(path, options)
     arrays, unread = open_zarr(path)
     check_zarr(path, arrays)
+    refuse_name_of_color(path, options)
     try:
         ends, state, action = (arrays[part][:] for part in ("ends", "state", "action"))
     except Exception as error:
@@ -930,8 +940,11 @@ def hdf5_arrays(path: Path, group: Any) -> dict[str, Any]:
 
 
 def hdf5_count(group: Any, name: str) -> int | None:
-    """A whole number among the attributes of a group."""
-    value = np.asarray(group.attrs.get(name, np.nan))
+    """A whole number among the attributes of a group; None where it cannot be read."""
+    try:
+        value = np.asarray(group.attrs.get(name, np.nan))
+    except OF_DAMAGED_HDF5:
+        return None
     return int(value) if value.shape == () and value.dtype.kind in "iu" else None
 
 
@@ -954,7 +967,7 @@ def libero_instruction(group: Any) -> str | None:
     """The instruction that LIBERO's files hold; others have none."""
     try:
         return json.loads(group.attrs["problem_info"])["language_instruction"]
-    except (KeyError, TypeError, ValueError):
+    except (*OF_DAMAGED_HDF5, TypeError):
         return None
 
 

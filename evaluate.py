@@ -525,8 +525,8 @@ def evaluate_checkpoint(
         text: task -> instruction feature, (text_dim,).
         episodes: rollouts of each task; episode i has the goal of `evaluation_seed(seed, i)`.
         seed: chooses goals, noise, reference demonstrations, and what inner steps are taken on.
-            With `known_goals` it chooses the last of these, and, where all rollouts of a task hold
-            one demonstration, which.
+            With `known_goals` it chooses the last of these alone and, in simulators with
+            `one_demonstration`, the reference demonstration.
         workers: processes; None: one a core.
         device: where the policy runs.
         n_demonstrations: use only the first so many of each recording; None: all.

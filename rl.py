@@ -62,7 +62,7 @@ from report import Outcomes, paper_columns, write_report
 from simulator import EPISODE_SEEDS, Simulator, episode_seed, evaluation_seed, simulator_of
 
 Batch = dict[str, Tensor]  # "states" (B, S), "actions" (B, A), "advantages" (B,)
-# Processes exchange arrays, since tensors go through shared memory, a file of it each.
+# Processes exchange arrays: each tensor would take a file in shared memory.
 Arrays = dict[str, np.ndarray]
 
 
@@ -90,7 +90,7 @@ class Settings:
     damping: float = setting(1e-5, "added to the Fisher matrix's diagonal", least=0)
     backtracks: int = setting(15, "steps that the line search tries", least=1)
     backtrack_ratio: float = setting(
-        0.8, "by how much the line search shortens the step each time", least=0, most=1
+        0.8, "the line search multiplies the step by this each time", least=0, most=1
     )
     episodes: int = setting(20, "goals of each task that are measured", least=1)
 
@@ -146,7 +146,7 @@ def policy_of(weights: Arrays) -> GaussianPolicy:
 
 
 def mean_action(weights: Arrays, state: np.ndarray) -> np.ndarray:
-    """`GaussianPolicy.mean` of a state (S,): the action (A,). In NumPy, since steps are small."""
+    """`GaussianPolicy.mean` of a state (S,): the action (A,). For one state NumPy is quicker."""
     x = state
     for layer in ("mean.0", "mean.2"):
         x = np.tanh(weights[f"{layer}.weight"] @ x + weights[f"{layer}.bias"])
@@ -712,13 +712,19 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     with locked(folder):
         if (folder / "success.json").exists() and not args.overwrite:
-            raise UserError(f"{folder} already holds results: add --overwrite, or another --out")
+            raise UserError(
+                f"{folder} already holds results: add --resume --overwrite to go on with its "
+                "training, or another --out"
+            )
         if args.resume:
             run = restore(checkpoint, settings, args.suite)
         elif checkpoint.exists():
             raise UserError(f"{folder} already holds a run: add --resume, or another --out")
         else:
             run = start(simulator, args.suite, settings)
+        (folder / "success.json").unlink(
+            missing_ok=True
+        )  # so that --resume alone goes on from here
         print_settings(asdict(settings), asdict(Settings()))
         steps = train(run, simulator, args.suite, settings, folder, args.workers)
         base_tasks, novel_tasks = simulator.tasks(args.suite)

@@ -174,13 +174,13 @@ class Settings:
     def lead(self) -> np.ndarray:
         """How far a pose that is sent is ahead of the measured one at most, see `Servo`: (2,).
 
-        In metres and radians, as is `target_speed`, a second.
+        Metres and radians.
         """
         return np.array([self.max_speed_m_s, self.max_speed_rad_s]) * self.servo_lookahead_s
 
     @property
     def target_speed(self) -> np.ndarray:
-        """How fast targets move at most, (2,)."""
+        """How fast targets move at most: (2,), metres and radians a second."""
         return self.lead / (self.servo_lookahead_s + STATE_DELAY)
 
     def refuse(self, name: str, why: str) -> None:
@@ -1541,6 +1541,11 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
             f"{config.action_dim} numbers, this robot {STATE_DIM} and {ACTION_DIM}: use a policy "
             "trained on its recordings"
         )
+    if config.point_dim != 3:
+        raise UserError(
+            f"{args.checkpoint} reads points of {config.point_dim} numbers, this robot sees "
+            "positions alone: use a policy trained on its recordings"
+        )
     if config.num_points > settings.num_points:
         raise UserError(
             f"{args.checkpoint} reads {config.num_points} points, num_points of the settings is "
@@ -1621,6 +1626,7 @@ def replay(args: argparse.Namespace, settings: Settings) -> None:
         raise UserError(f"{args.data} has {len(recording)} episodes: no --episode {args.episode}")
     frames = recording.episode(args.episode)
     recorded = recording.action[frames]  # (T, A)
+    settings.check_steps(recorded)  # divided into parts, a jump would be none
     actions = at_allowed_speed(recorded, settings)
     if len(actions) > len(recorded):
         print(
@@ -1893,8 +1899,9 @@ def record_episodes(
         cell.prepare(servo)
         recorder = Recorder(args=args, cell=cell, out=out, meta=meta, kept=kept)
         closed = cell.gripper.read()
-        if moves and 0.1 < closed < 0.9:
-            raise UserError(f"the gripper is half open ({closed:.2f}): open or close it first")
+        if moves and 0.1 < closed < 0.9:  # it may hold something: closed is what it is told
+            cell.gripper.move(1.0)
+            closed = 1.0
         recorder.closed = float(closed > 0.5)
         try:
             servo.start(args.host)

@@ -126,8 +126,8 @@ HIDDEN_METHOD = {
     "inner": INNER,
     "inner-first-order": f"{INNER} --maml first",
     "both": "",
-    # In worlds of tests.oracle: rates of the inner step are learned for the weights of "neither",
-    # after its 1,500 steps; and the cloud shows the goal
+    # In worlds of tests.oracle. "frozen": after the 1,500 steps of "neither" only rates of the
+    # inner step are learned. "marker": the cloud shows the goal.
     "frozen": f"{LEARNED_RATES} --pretrain-fraction 0.75 --steps 2000",
     "marker": "--maml off --demo-encoder none --data data-marker",
     # Fewer or more goals than the 160 of "demonstration", and as many windows a step, 80
@@ -279,7 +279,8 @@ class Job:
         with self.log.open("a") as log:
             print(f"$ python {self.command}", file=log, flush=True)
             words = [sys.executable, *self.command.split()]
-            process = subprocess.Popen(words, stdout=log, stderr=log)
+            # In a session of its own: Ctrl-C reaches it once, by `terminate`.
+            process = subprocess.Popen(words, stdout=log, stderr=log, start_new_session=True)
             running.add(process)
             code = process.wait()
             running.discard(process)
@@ -386,7 +387,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     with ThreadPoolExecutor(args.at_once) as pool:
         try:
             failed = sum(pool.map(partial(run_in_order, stopped=stopped), runs))
-        except KeyboardInterrupt:  # also of `kill`, which does not reach the processes by itself
+        except BaseException:  # Ctrl-C and `kill`, too
             stopped.set()
             for process in list(running):
                 process.terminate()  # a training saves, and ends

@@ -163,9 +163,11 @@ def test_a_step_into_nothing_is_no_error_but_is_not_taken(adapted):
         assert not (loss < 0 and kl <= 0.02)  # what the line search asks for
 
 
-def test_where_no_step_is_good_enough_nothing_is_changed(adapted):
+def test_where_no_step_is_good_enough_nothing_is_changed(adapted, monkeypatch):
     policies, params, support, query = adapted
-    settings = replace(POINT, inner_lr=policies.inner_lr, max_kl=0.0)  # no step keeps to that
+    settings = replace(POINT, inner_lr=policies.inner_lr, max_kl=0.02)
+    worse = lambda *_: (np.inf, 0.0)  # noqa: E731
+    monkeypatch.setattr(AdaptedPolicies, "surrogate_loss_and_kl", worse)
     figures = rl.trpo_step(policies.policy, support, query, settings)
     assert (figures["kl"], figures["backtracks"]) == (0.0, POINT.backtracks)
     for name, p in policies.policy.named_parameters():
@@ -321,12 +323,12 @@ AGAIN = "--resume --overwrite --out run".split()
     ("arguments", "message"),
     [
         (["--resume", "--out", "nothing"], "there is no run to resume"),
-        (["--out", "run"], "already holds results: add --overwrite, or another --out"),
+        (["--out", "run"], "already holds results: add --resume --overwrite to go on"),
         (["--out", "run", "--overwrite"], "add --resume, or another --out"),
         ([*AGAIN, "--hidden", "9"], "trained with other settings (hidden"),
         (["--resume", "--out", "damaged"], "is damaged"),
         (["--resume", "--out", "foreign"], "is of no run of rl.py"),
-        (["--out", "results"], "already holds results: add --overwrite, or another --out"),
+        (["--out", "results"], "already holds results: add --resume --overwrite to go on"),
         (["--suite", "poin"], "did you mean 'point'"),
         ([*AGAIN, "--steps", "80"], "160 are taken already"),
         (["--max-kl", "-1"], "--max-kl is -1.0: use at least 0"),
