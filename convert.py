@@ -285,8 +285,24 @@ def color_image(path: Path, name: str, color: np.ndarray, depth: np.ndarray) -> 
 # What the name of an array may say beside which camera it is of. Not "color": the intrinsics of a
 # color image are not those of depth.
 NO_CAMERA = {
-    *("obs", "observation", "observations", "images", "image", "sensor", "data", "param", "params"),
-    *("camera", "cam", "depth", "intrinsic", "intrinsics", "extrinsic", "extrinsics", "cv", "k"),
+    "obs",
+    "observation",
+    "observations",
+    "images",
+    "image",
+    "sensor",
+    "data",
+    "param",
+    "params",
+    "camera",
+    "cam",
+    "depth",
+    "intrinsic",
+    "intrinsics",
+    "extrinsic",
+    "extrinsics",
+    "cv",
+    "k",
     "matrix",
 }
 
@@ -300,13 +316,16 @@ def of_same_camera(path: Path, depth: str, found: list[str]) -> str | None:
     """Which of the intrinsics or extrinsics `found` are of the camera of the depth.
 
     Those whose name says the same camera as the depth's; if there are none, those whose name says
-    no camera. RecordingError unless one is left, or nothing was found.
+    no camera. None where nothing was found; RecordingError unless exactly one is left.
     """
-    own = [name for name in found if camera_of(name) == camera_of(depth)]
-    left = own or [name for name in found if not camera_of(name)]
-    if found and len(left) != 1:
+    if not found:
+        return None
+    chosen = [name for name in found if camera_of(name) == camera_of(depth)]
+    if not chosen:
+        chosen = [name for name in found if not camera_of(name)]
+    if len(chosen) != 1:
         refuse(path, f"has {', '.join(found)}: write what belongs to {depth} to --camera")
-    return left[0] if left else None
+    return chosen[0]
 
 
 def intrinsics_of(path: Path, name: str, intrinsics: np.ndarray, depth: np.ndarray) -> list[float]:

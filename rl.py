@@ -178,7 +178,8 @@ def environment(simulator: Simulator, task: str) -> Any:
     env = simulator.make(task, simulator.recipe["num_points"])
     if not hasattr(env, "state_without_goal"):
         raise UserError(
-            f"{simulator.name} has no low-dimensional states: use a suite of Meta-World, as ml10"
+            f"{simulator.name} has no low-dimensional states: use one of Meta-World's suites, such "
+            "as ml10"
         )
     return env
 
@@ -492,8 +493,10 @@ def iterate(
         for i, task in enumerate(tasks_of_iteration(tasks, iteration, settings))
     ]
     weights = to_arrays(dict(policy.named_parameters()))
-    arguments = {"simulator": simulator, "weights": weights, "settings": settings}
-    jobs = [{"goal": goal, **arguments} for goal in goals]
+    jobs = [
+        {"goal": goal, "simulator": simulator, "weights": weights, "settings": settings}
+        for goal in goals
+    ]
     support, query = zip(*pool.run(goal_job, jobs, bar))
     figures_of_step = trpo_step(
         policy,
@@ -672,8 +675,10 @@ def measure(
         for i in range(settings.episodes)
     ]
     weights = to_arrays(dict(policy.named_parameters()))
-    arguments = {"simulator": simulator, "weights": weights, "settings": settings}
-    jobs = [{"goal": goal, **arguments} for goal in goals]
+    jobs = [
+        {"goal": goal, "simulator": simulator, "weights": weights, "settings": settings}
+        for goal in goals
+    ]
     results = run_jobs(
         measure_job, jobs, workers=workers, total=len(jobs), description="evaluating", unit="goal"
     )
@@ -722,9 +727,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise UserError(f"{folder} already holds a run: add --resume, or another --out")
         else:
             run = start(simulator, args.suite, settings)
-        (folder / "success.json").unlink(
-            missing_ok=True
-        )  # so that --resume alone goes on from here
+        # Without old results, --resume alone goes on from here.
+        (folder / "success.json").unlink(missing_ok=True)
         print_settings(asdict(settings), asdict(Settings()))
         steps = train(run, simulator, args.suite, settings, folder, args.workers)
         base_tasks, novel_tasks = simulator.tasks(args.suite)

@@ -1033,7 +1033,8 @@ class Servo:
 
         self.pose = rtde.state(settings.max_state_age_s).pose  # commanded last
         self.sent = self.pose  # sent last: ahead of the measured pose by no more than `lead`
-        self.lead, self.speed = settings.lead, settings.target_speed
+        self.lead = settings.lead
+        self.speed = settings.target_speed
         self.targets: list[tuple[float, np.ndarray]] = []  # (when, pose)
         self.broken_off = False  # targets were left out, by `hold`
         self.held_since = time.monotonic()

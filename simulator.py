@@ -184,7 +184,8 @@ def environments_of(
     Environments of the previous call are used again, for another task if they can change to it. So
     those must not be needed any more.
     """
-    environments, kept.environments = kept.environments, []  # forgotten, should anything fail
+    environments = kept.environments
+    kept.environments = []  # should anything fail below, none is kept
     if kept.made_for != (simulator, num_points):
         environments = []
     elif kept.task != task:
@@ -195,7 +196,9 @@ def environments_of(
         ]
     while len(environments) < number:
         environments.append(simulator.make(task, num_points))
-    kept.made_for, kept.task, kept.environments = (simulator, num_points), task, environments
+    kept.made_for = (simulator, num_points)
+    kept.task = task
+    kept.environments = environments
     return environments[:number]
 
 

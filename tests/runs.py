@@ -107,10 +107,8 @@ CURVE = {  # along the adaptation, and with fewer demonstrations; flags of finet
     "3-shot": "--demonstrations 3",
     "5-shot": "--demonstrations 5",
 }
-REPORTS |= {
-    name: (f"finetune.py --task novel --checkpoint {{run}} {flags}", SHOWN)
-    for name, flags in CURVE.items()
-}
+for name, flags in CURVE.items():
+    REPORTS[name] = (f"finetune.py --task novel --checkpoint {{run}} {flags}", SHOWN)
 
 # Where goals are hidden. Some variants read a demonstration; those that read none have the same
 # batches, and some of them take inner steps. A step without inner step takes a fifth of the time of

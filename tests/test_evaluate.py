@@ -282,11 +282,18 @@ def test_inner_steps_of_each_task_and_seed_have_draws_of_their_own(run, recordin
         return [(1, 0.0, policy)]
 
     monkeypatch.setattr(evaluate, "take_inner_steps", steps)
-    base = {task: recordings[task] for task in TASKS}
-    arguments = run / "ema-00006.pt", ToySimulator(), base, dict.fromkeys(TASKS, torch.zeros(512))
     for seed in (0, 1, 0):
-        options = {"inner_steps": 1, "inner_lr": 0.1, "support": 4}
-        evaluate.evaluate_checkpoint(*arguments, episodes=1, seed=seed, **options)
+        evaluate.evaluate_checkpoint(
+            checkpoint=run / "ema-00006.pt",
+            simulator=ToySimulator(),
+            recordings={task: recordings[task] for task in TASKS},
+            text={task: torch.zeros(512) for task in TASKS},
+            episodes=1,
+            seed=seed,
+            inner_steps=1,
+            inner_lr=0.1,
+            support=4,
+        )
         evaluate.keep_policy_of_task.cache_clear()
     assert len(set(seeds)) == 4 and seeds[:2] == seeds[4:]
 

@@ -363,7 +363,7 @@ def test_the_policy_without_a_demonstration_is_the_textbooks_dp3():
     batch = random_batch(policy.config, windows=20)
     batch = {name: x for name, x in batch.items() if name not in TASK_INPUTS}
     recorded = {name: 3 * batch[name] + 1 for name in ("points", "state", "action")}
-    batch |= recorded
+    batch.update(recorded)
     policy.normalizer.fit([SimpleNamespace(**recorded)])
     textbook = TextbookDP3(policy.config)
     textbook.load_state_dict(policy.state_dict())

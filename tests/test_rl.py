@@ -363,5 +363,5 @@ def test_a_simulator_without_such_states_is_refused():
         def make(self, task, num_points):
             return object()
 
-    with pytest.raises(common.UserError, match="use a suite of Meta-World, as ml10"):
+    with pytest.raises(common.UserError, match="use one of Meta-World's suites, such as ml10"):
         rl.environment(SimulatorWithoutStates(), "move")
