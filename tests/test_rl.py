@@ -174,6 +174,15 @@ def test_where_no_step_is_good_enough_nothing_is_changed(adapted, monkeypatch):
         assert torch.equal(p, params[name])
 
 
+def test_all_layers_begin_at_glorots_scale():
+    torch.manual_seed(0)
+    policy = GaussianPolicy(state_dim=39, action_dim=4, hidden=128)
+    for layer in (policy.mean[0], policy.mean[2], policy.mean[4]):
+        largest = (6 / (layer.in_features + layer.out_features)) ** 0.5  # of a uniform law
+        assert 0.99 * largest < layer.weight.abs().max() <= largest
+        assert (layer.bias == 0).all()
+
+
 def test_the_mean_action_in_numpy_is_that_of_the_policy():
     torch.manual_seed(0)
     policy = GaussianPolicy(5, 3, hidden=7)
