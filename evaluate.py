@@ -420,7 +420,7 @@ def instruction_features(
 
 
 @lru_cache(maxsize=1)
-def keep_policy(
+def cached_policy(
     checkpoint: str | Path, device: str, config_overrides: tuple[tuple[str, Any], ...]
 ) -> tuple[DAMIPolicy, dict[str, Any]]:
     """`load_trained`, whose result a process keeps until it is asked for another policy."""
@@ -468,14 +468,14 @@ def adaptation_sampler(
 
 
 @lru_cache(maxsize=1)
-def keep_policy_of_task(wanted: PolicyOfTask) -> tuple[DAMIPolicy, WindowSampler, Tensor]:
+def cached_policy_of_task(wanted: PolicyOfTask) -> tuple[DAMIPolicy, WindowSampler, Tensor]:
     """A policy for a task, kept until this process works on another task, or in another way.
 
     Returns:
         The policy, adapted to the task where there are inner steps; the windows of the task's
         demonstrations; and the instruction feature, (text_dim,).
     """
-    policy, info = keep_policy(wanted.checkpoint, wanted.device, wanted.config_overrides)
+    policy, info = cached_policy(wanted.checkpoint, wanted.device, wanted.config_overrides)
     demonstrations = load_demonstrations(wanted.recording).take(wanted.n_demonstrations)
     sampler = adaptation_sampler(demonstrations, policy, info, wanted.device)
     text = torch.from_numpy(np.frombuffer(wanted.text, np.float32).copy()).to(wanted.device)
@@ -627,7 +627,7 @@ def rollout_job(
     whether each of them did the other task of a pair. The second list is empty where tasks are no
     pairs, see unnamed_tasks.py.
     """
-    policy, sampler, text = keep_policy_of_task(wanted)
+    policy, sampler, text = cached_policy_of_task(wanted)
     environments = environments_of(simulator, task, len(seeds), policy.config.num_points)
     reference = None
     if reference_seed is not None:

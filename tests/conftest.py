@@ -100,8 +100,8 @@ def small_suite():
 @pytest.fixture(autouse=True)
 def nothing_kept(monkeypatch):
     """No test meets a policy or an environment that an earlier one left in this process."""
-    evaluate.keep_policy.cache_clear()
-    evaluate.keep_policy_of_task.cache_clear()
+    evaluate.cached_policy.cache_clear()
+    evaluate.cached_policy_of_task.cache_clear()
     monkeypatch.setattr(simulator, "kept", simulator.KeptEnvironments())
 
 

@@ -686,6 +686,24 @@ def turned_actions_table(results: Results, skill: str) -> str:
     return format_table(rows)
 
 
+def rl_table(results: Results) -> str:
+    """What reinforcement learning reaches on ML10: success before and after its inner step."""
+    rows = [["ML10", "base tasks", "base, at the end", "novel tasks", "novel, at the end"]]
+    for title, label in (
+        ("MAML-TRPO, before the inner step", "before"),
+        ("MAML-TRPO, after it", "after one inner step"),
+    ):
+        cells = []
+        for split in ("base", "novel"):
+            for at_end in (False, True):
+                column = Column("rl", label, at_end=at_end)
+                cells.append(pooled(results, "rl-ml10", column, TASKS["ml10"][split]))
+        rows.append([title, *cells])
+    base, novel = (paper_mean("ml10", split, PAPER_NAMES["rl"]) for split in ("base", "novel"))
+    rows.append(['paper, "Meta-World"', base, "", novel, ""])
+    return format_table(rows)
+
+
 TABLES: dict[str, Callable[[Results], str]] = {
     "goals": hidden_summary_table,
     "goals reach": lambda results: hidden_goals_table(results, "reach"),
@@ -695,6 +713,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "pairs": pairs_table,
     "turned actions": lambda results: turned_actions_table(results, "reach"),
     "means": lambda results: means_table(results, "ml10"),
+    "rl": rl_table,
     "base": lambda results: by_task_table(results, "base", "ml10"),
     "novel": lambda results: by_task_table(results, "novel", "ml10"),
     "old variants": variants_table,

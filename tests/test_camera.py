@@ -15,7 +15,6 @@ from camera import RayCastCamera
 from metaworld_env import MetaWorldPointCloudEnv
 
 ROOT = Path(metaworld_env.__file__).resolve().parent
-WHOLE_IMAGE = ((-9, -9, -9), (9, 9, 9))
 
 
 def scene(world, assets="", visual=""):

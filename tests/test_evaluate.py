@@ -294,7 +294,7 @@ def test_inner_steps_of_each_task_and_seed_have_draws_of_their_own(run, recordin
             inner_lr=0.1,
             support=4,
         )
-        evaluate.keep_policy_of_task.cache_clear()
+        evaluate.cached_policy_of_task.cache_clear()
     assert len(set(seeds)) == 4 and seeds[:2] == seeds[4:]
 
 
@@ -327,14 +327,14 @@ def test_what_a_process_keeps_is_not_mistaken_for_something_else(run, recordings
     wanted = policy_of_task(run / "ema-00006.pt", recordings["touch-red"])
 
     def weights_for(**changes):
-        policy, _, _ = evaluate.keep_policy_of_task(replace(wanted, **changes))
+        policy, _, _ = evaluate.cached_policy_of_task(replace(wanted, **changes))
         return dict(policy.named_parameters())
 
-    _, sampler, text = evaluate.keep_policy_of_task(wanted)
-    _, fewer, _ = evaluate.keep_policy_of_task(replace(wanted, n_demonstrations=1))
+    _, sampler, text = evaluate.cached_policy_of_task(wanted)
+    _, fewer, _ = evaluate.cached_policy_of_task(replace(wanted, n_demonstrations=1))
     assert (len(sampler.episodes), len(fewer.episodes)) == (2, 1)
     ones = np.ones(512, np.float32).tobytes()
-    _, _, other_text = evaluate.keep_policy_of_task(replace(wanted, text=ones))
+    _, _, other_text = evaluate.cached_policy_of_task(replace(wanted, text=ones))
     assert not text.any() and other_text.all()
 
     kept = [

@@ -3,10 +3,12 @@
 from dataclasses import replace
 from itertools import combinations
 
+import metaworld
 import mujoco
 import numpy as np
 import pytest
 import torch
+from metaworld.policies import ENV_POLICY_MAP
 
 import evaluate
 import hidden_goals
@@ -15,6 +17,7 @@ import simulator
 import train
 from data import WindowSampler, load_demonstrations
 from hidden_goals import SKILLS, HiddenGoalEnv, HiddenGoals, goal_of, names_of, start_of
+from metaworld_env import make_sawyer_env
 from simulator import (
     collect_task,
     demonstration_seed,
@@ -53,6 +56,34 @@ def test_goals_lie_on_a_wide_area_and_no_two_are_one(skill):
         low[2] = high[2] = hidden_goals.ON_TABLE
     assert (goals >= low).all() and (goals <= high).all()
     assert (np.ptp(goals, axis=0) >= 0.8 * (high - low)).all()
+
+
+@pytest.mark.filterwarnings("ignore:Constant")  # of Meta-World's expert
+def test_in_meta_worlds_own_ml1_a_replay_of_the_actions_is_enough():
+    """A task of ML1 has one goal and one start: nothing of its demonstration has to be read."""
+    benchmark = metaworld.ML1("push-v3", seed=0)
+    env = make_sawyer_env("push")
+
+    def begin(task):
+        env.set_task(task)
+        env._partially_observable = False  # the expert reads the goal
+        return env.reset()[0]
+
+    successes = []
+    for task in benchmark.test_tasks[:5]:
+        expert, observation, actions = ENV_POLICY_MAP["push-v3"](), begin(task), []
+        start, by_expert, by_replay = observation, False, False
+        for _ in range(100):
+            actions.append(np.clip(expert.get_action(observation), -1, 1))
+            observation, _, _, _, info = env.step(actions[-1])
+            by_expert |= bool(info["success"])
+        assert np.array_equal(begin(task), start)
+        for action in actions:
+            _, _, _, _, info = env.step(action)
+            by_replay |= bool(info["success"])
+        assert by_replay == by_expert
+        successes.append(by_replay)
+    assert sum(successes) >= 4
 
 
 def test_no_start_is_so_near_a_goal_that_meta_world_would_draw_it_again():

@@ -33,7 +33,6 @@ from model import (
 from tests.textbook import TextbookDP3
 
 TINY = PRESETS["tiny"]
-TASKLESS = {"demo_encoder": "none", "tcfm": "none"}
 # (demo_encoder, tcfm)
 ABLATIONS = [("vmt", "down"), ("vmt", "mid"), ("vmt", "up"), ("mlp", "down"), ("none", "down")]
 ABLATIONS += [("mlp", "none"), ("vmt", "none"), ("none", "none")]
