@@ -536,6 +536,21 @@ HIDDEN_ROWS = (
         "demonstration-twice-the-rate",
         Column("novel", 0),
     ),
+    (
+        "with the goal's own, trained for twice as many steps",
+        "demonstration-twice-as-long",
+        Column("novel", 0),
+    ),
+    (
+        "the same, trained for twice as many steps, from 20 starts",
+        "demonstration-twice-as-long",
+        Column("starts"),
+    ),
+    (
+        "with another goal's, trained for twice as many steps",
+        "demonstration-twice-as-long",
+        Column("novel", SHOWN_ANOTHER),
+    ),
     ("second order: before any step", "inner", Column("0-steps")),
     ("second order: 1 inner step", "inner", Column("1-steps")),
     ("second order: 1 inner step on another goal", "inner", Column("1-steps-swap", SHOWN_ANOTHER)),
@@ -590,6 +605,10 @@ def hidden_goals_table(results: Results, skill: str) -> str:
 HIDDEN_SUMMARY = {  # the most important of these rows -> their titles in README
     "with the goal's own demonstration": "a demonstration of the goal",
     "the same, from 20 starts": "the same, from 20 starts in place of five",
+    "with the goal's own, trained for twice as many steps": "the same, with twice as many steps",
+    "the same, trained for twice as many steps, from 20 starts": (
+        "the same, with twice as many steps, from 20 starts"
+    ),
     "with another goal's": "a demonstration of another goal",
     "with zeros in its place": "zeros in its place",
     "second order: before any step": "no demonstration, second-order MAML: before any step",
