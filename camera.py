@@ -168,13 +168,13 @@ class RayCastCamera:
         site_colors = drawn_colors(model, "site", groups)
         self.colors = np.concatenate([geom_colors[:, :3], site_colors[:, :3], [SKY]])
 
-        # The model as rays are to see it. `mj_multiRay` passes by a body if a ray does not meet its
-        # bounding volume; but that is made for collisions, and lacks the geoms that take no part in
-        # them. Without one, each ray is tested against each geom, as `mj_ray` does.
+        # The model as rays are to see it. `mj_multiRay` skips a body whose bounding volume a
+        # ray misses. But that volume is made for collisions, and lacks the geoms that take no part
+        # in them. Without one, each ray is tested against each geom, as `mj_ray` does.
         self.view = copy.copy(model)
         self.view.body_bvhadr[:] = -1
-        self.view.geom_rgba[:] = geom_colors  # rays pass geoms without a material if alpha is 0
-        self.view.geom_matid[:] = -1
+        self.view.geom_rgba[:] = geom_colors
+        self.view.geom_matid[:] = -1  # a ray goes through a geom of alpha 0 only without a material
         meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
         self.types, self.cloud_types = model.geom_type.copy(), model.geom_type.copy()
         ellipsoid = mujoco.mjtGeom.mjGEOM_ELLIPSOID
@@ -285,13 +285,20 @@ class RayCastCamera:
         return (points, hit) if segmentation else points
 
     def depth(self, data: mujoco.MjData) -> np.ndarray:
-        """Returns metres along the viewing direction (H, W), inf where nothing is hit."""
+        """Returns metres along the viewing direction (H, W) float64, inf where nothing is hit.
+
+        All that the camera sees is in it: box and background do not apply. Raises ValueError as
+        `points` does.
+        """
         origin, axes = self.pose(data)
         distance, _ = self.cast(data, origin, self.rays @ axes.T, self.types)
         return (distance * -self.rays[:, 2]).reshape(self.height, self.width)
 
     def render(self, data: mujoco.MjData, height: int, width: int) -> np.ndarray:
-        """Returns a picture (height, width, 3) uint8, shaded by the slope of the surfaces."""
+        """Returns a picture (height, width, 3) uint8, shaded by the slope of the surfaces.
+
+        Box and background do not apply. Raises ValueError as `points` does.
+        """
         origin, axes = self.pose(data)
         rays = self.pixel_rays(height, width) @ axes.T
         distance, hit = self.cast(data, origin, rays, self.types)

@@ -312,19 +312,25 @@ def read_clip_file(path: Path) -> CLIPTextEncoder:
     """
     if not path.is_file():
         raise TextWeightsError(f"{path}: there is no such file; give CLIP's ViT-B-32.pt")
-    sha256 = file_sha256(path)
+    try:
+        sha256 = file_sha256(path)
+    except PermissionError as error:
+        raise TextWeightsError(f"{path} cannot be read: {error.strerror}") from error
     if sha256 == CLIP_SHA256:
         return read_official(path)
 
+    names = []
     with open(path, "rb") as file:
         like_zip = file.read(2) == b"PK"
-    if like_zip and not zipfile.is_zipfile(path):  # a zip's table of contents stands at its end
-        size = path.stat().st_size
-        raise TextWeightsError(f"{path}: the file is cut off after {size} bytes; fetch it again")
-    names = []
     if like_zip:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
+        try:
+            with zipfile.ZipFile(path) as archive:
+                names = archive.namelist()
+        except Exception:  # of many types; a zip's table of contents stands at its end
+            size = path.stat().st_size
+            raise TextWeightsError(
+                f"{path}: the file is cut off after {size} bytes, or damaged; fetch it again"
+            ) from None
     if any(name.endswith("/constants.pkl") for name in names):
         raise TextWeightsError(
             f"{path}: a TorchScript archive with SHA-256 {sha256[:8]}..., not the official "
@@ -342,7 +348,9 @@ def read_clip_file(path: Path) -> CLIPTextEncoder:
         raise TextWeightsError(
             f"{path}: neither CLIP's ViT-B-32.pt nor a plain state dict ({reason})"
         ) from None
-    if not isinstance(weights, dict) or not all(isinstance(x, Tensor) for x in weights.values()):
+    if not isinstance(weights, dict) or not all(
+        isinstance(name, str) and isinstance(x, Tensor) for name, x in weights.items()
+    ):
         raise TextWeightsError(f"{path}: neither CLIP's ViT-B-32.pt nor a plain state dict")
     return CLIPTextEncoder(as_openai_names_them(weights), f"state-dict-{sha256[:8]}")
 
@@ -418,6 +426,7 @@ def load_clip_text_encoder(
             if not download:
                 raise OSError("downloading is off")
             download_clip(path)
+        sha256 = file_sha256(path)
     except (OSError, http.client.HTTPException) as error:
         advice = f"put its ViT-B-32.pt at {path} or name it" if path else "name its ViT-B-32.pt"
         warnings.warn(
@@ -427,7 +436,7 @@ def load_clip_text_encoder(
             stacklevel=2,
         )
         return random_clip_text_encoder(seed)
-    if file_sha256(path) != CLIP_SHA256:
+    if sha256 != CLIP_SHA256:
         raise TextWeightsError(
             f"{path}: damaged, its SHA-256 is not that of ViT-B-32.pt; delete it"
         )
@@ -440,7 +449,7 @@ def text_features(
     """Encodes instructions with the frozen text tower.
 
     Args:
-        instructions: plain sentences, B of them.
+        instructions: plain sentences, B of them, at least one.
         weights: the value of --clip-weights: a file or `random`. None: the cached file, else a
             download, else random weights.
         identity: the text weights that a checkpoint was made with. No others are accepted, and if
@@ -452,7 +461,7 @@ def text_features(
     Raises:
         TextWeightsError: the weights that can be had are not those of the checkpoint.
     """
-    random_seed = re.fullmatch(r"random-seed-(\d+)", identity or "")
+    random_seed = re.fullmatch(r"random-seed-(-?\d+)", identity or "")
     if weights is None and (identity or "").startswith("state-dict-"):
         raise TextWeightsError(
             f"the checkpoint was made with the text weights {identity!r}: name their file with "

@@ -153,8 +153,9 @@ def command_line(main: Callable[[], None], errors: tuple[type[Exception], ...] =
     """Runs a script's `main` and turns what a user can cause into one line on stderr.
 
     UserError, the exception types in `errors` (those of damaged or foreign files), a full disk and
-    too little memory end in exit code 2; Ctrl-C, SIGTERM and a closed terminal in 130. Every other
-    exception is a mistake in the code and keeps its traceback; `python -X dev` shows all of them.
+    too little memory end in exit code 2; Ctrl-C, SIGTERM and a closed terminal in 130; a closed
+    pipe, such as `| head`, in 1 and without a word. Every other exception is a mistake in the code
+    and keeps its traceback; `python -X dev` shows all of them.
     """
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     for number in SIGNALS:
@@ -162,9 +163,15 @@ def command_line(main: Callable[[], None], errors: tuple[type[Exception], ...] =
             signal.signal(number, signal.default_int_handler)
     try:
         main()
+        print(end="", flush=True)  # or what cannot be written is found out when Python ends
         return
     except KeyboardInterrupt as interrupt:
         line, code = f"interrupted: {interrupt}".removesuffix(": "), 130
+    except BrokenPipeError:
+        if not nobody_reads_the_output():
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left is lost
+        sys.exit(1)
     except Exception as error:
         line, code = describe_user_error(error, errors), 2
         if line is None or sys.flags.dev_mode:
@@ -174,6 +181,15 @@ def command_line(main: Callable[[], None], errors: tuple[type[Exception], ...] =
     sys.exit(code)
 
 
+def nobody_reads_the_output() -> bool:
+    """Whether standard output leads into a pipe that was closed, as by `| head`."""
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        return True
+    return False
+
+
 def describe_user_error(error: Exception, errors: tuple[type[Exception], ...]) -> str | None:
     """The line for an error that is meant for a user; None for a mistake in the code."""
     if isinstance(error, (UserError, *errors)):
@@ -181,7 +197,7 @@ def describe_user_error(error: Exception, errors: tuple[type[Exception], ...]) -
     if isinstance(error, OSError) and error.errno in FULL_DISK:
         return f"error: {error.filename or 'a file'} was not written, {error.strerror}: make room"
     out_of_memory = isinstance(error, (MemoryError, torch.OutOfMemoryError))
-    if out_of_memory or "can't allocate memory" in str(error):  # a RuntimeError on a CPU
+    if out_of_memory or "DefaultCPUAllocator" in str(error):  # a RuntimeError on a CPU
         return "error: out of memory: use a smaller --preset, or fewer windows, tasks or workers"
     return None
 
@@ -424,6 +440,8 @@ class WorkerPool:
         if workers is not None and workers < 1:
             raise UserError(f"--workers is {workers}: use at least 1")
         self.workers = workers or usable_cores()
+        if sys.platform == "win32":
+            self.workers = min(self.workers, 61)  # Python waits for no more of them there
         context = multiprocessing.get_context("spawn")  # neither threads nor a GPU survive a fork
         self.existing_children = set(multiprocessing.active_children())
         self.started = False  # whether a process ever was

@@ -22,7 +22,7 @@ import numpy as np
 from metaworld import env_dict
 from metaworld.policies import ENV_POLICY_MAP
 
-from camera import RayCastCamera
+from camera import RayCastCamera, geoms_of
 from common import choose
 from data import farthest_point_sample
 from simulator import OutOfSightError
@@ -177,8 +177,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
 
         model = sawyer_env.model
         model.camera(CAMERA).pos[:] = CAMERA_POSITION
-        links = [model.body(name).id for name in ARM_LINKS]
-        self.arm_geoms = np.flatnonzero(np.isin(model.geom_bodyid, links))
+        self.arm_geoms = np.flatnonzero(geoms_of(model, ARM_LINKS))
         self.camera = self.make_camera(self.camera_pixels, self.hidden_sites)
         self.observation_space = gymnasium.spaces.Dict(
             {
@@ -191,7 +190,8 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
     def make_camera(self, pixels: int, hidden_sites: Collection[str] = ()) -> RayCastCamera:
         """Makes a camera of `pixels` rows and columns that sees the workspace.
 
-        It does not see the sites of these names, such as goal markers; others still do.
+        Sites of the names in `hidden_sites`, such as goal markers, are hidden from this camera
+        alone.
         """
         model = self.sawyer_env.model
         # The floor, the table and its walls: bodies with a geom as wide as the workspace.
@@ -236,12 +236,19 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         return expert_observation
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
-        """Takes one step: `advance`, then `observe`."""
+        """Takes one step: `advance`, then `observe`.
+
+        Returns (observation, reward, False, truncated, info). Raises ValueError for an action that
+        is not four finite numbers, and OutOfSightError where nothing is seen.
+        """
         reward, truncated, info = self.advance(action)
         return self.observe(), reward, False, truncated, info
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
-        """Takes one step without casting rays. Returns (reward, truncated, info)."""
+        """Takes one step without casting rays. Returns (reward, truncated, info).
+
+        Raises ValueError for an action that is not four finite numbers.
+        """
         action = np.asarray(action, dtype=np.float32)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"an action is four finite numbers, not {action}")
@@ -263,7 +270,10 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         return self.sawyer_env.data.body("hand").xpos.copy()
 
     def observe(self) -> dict[str, np.ndarray]:
-        """Casts the rays and returns the observation of the present moment."""
+        """Casts the rays and returns the observation of the present moment.
+
+        Raises OutOfSightError where nothing is seen.
+        """
         data = self.sawyer_env.data
         right_finger = data.site("rightEndEffector").xpos
         left_finger = data.site("leftEndEffector").xpos

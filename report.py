@@ -212,8 +212,8 @@ def write_report(
             the end if they were measured, and one of those at the other task if tasks are pairs.
         parts, paper: see `success_table`.
         provenance: how the results were measured, name -> value; "title" is the chart's.
-        checkpoints: label -> results, those of other checkpoints among them. They are written into
-            success.json, and stand in no table.
+        checkpoints: label -> results of all checkpoints, also of those that `outcomes` leaves out.
+            They are written into success.json, and stand in no table.
         pooled: table and chart put the episodes of all tasks together: a row for each label.
     """
     kinds = {"any step": {}, "at the end": {}, "the other task": {}}  # -> label -> successes
@@ -327,7 +327,10 @@ def plot_success(
     axes.set_xticks(middles, tasks, rotation=30, ha="right")
     axes.set(ylabel="success, %", ylim=(0, 112 if parts else 105), title=title)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(frameon=False, ncols=n_bars, loc="outside upper center", fontsize=8)
+    # As many columns as fit: a letter takes 0.07 inches.
+    longest = max(len(label) for label in (*columns, *paper))
+    ncols = max(1, int(figure.get_figwidth() / (0.07 * longest + 0.6)))
+    figure.legend(frameon=False, ncols=ncols, loc="outside upper center", fontsize=8)
     save_png(figure, path, dpi=120)
 
 
@@ -440,7 +443,8 @@ def plot_demonstration(
     axes.set(xlabel="frame", ylabel="action")
     axes.legend(loc="upper right", ncols=4)
     title = f"{demonstrations.task}, episode {episode}: {demonstrations.instruction}"
-    figure.suptitle(title.replace("$", r"\$"))  # or Matplotlib would typeset a formula
+    # Matplotlib would typeset a formula between dollars.
+    figure.suptitle(title.replace("$", r"\$"), wrap=True)
     save_png(figure, path, dpi=110)
 
 

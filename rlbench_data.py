@@ -221,7 +221,8 @@ class KeepingUnpickler(pickle.Unpickler):
     """Reads a pickle in which only KNOWN_NAMES stand; RecordingError for any other name."""
 
     def find_class(self, module: str, name: str) -> type[Kept]:
-        known = KNOWN_NAMES.get((module, name))  # the whole name: no attribute of an allowed one
+        # A dotted name such as `ndarray.tofile` is not taken apart, and so it is unknown.
+        known = KNOWN_NAMES.get((module, name))
         if known is None:
             raise RecordingError(
                 f"names {f'{module}.{name}'[:100]!r}, which no recording of RLBench needs: a "
@@ -243,6 +244,8 @@ def read_pickle(path: Path) -> Any:
             return KeepingUnpickler(file).load()
     except RecordingError as error:
         refuse(path, str(error))
+    except PermissionError as error:
+        refuse(path, f"cannot be read: {error.strerror}")
     except Exception as error:  # pickle raises many types; each means it cannot be read
         reason = " ".join(str(error).split())[:200]
         refuse(path, f"is damaged or no pickle: {reason}; download it again")
@@ -259,14 +262,14 @@ def read_numbers(
     Raises RecordingError for anything else, or (unless it is None) for another shape.
     """
     try:
-        array = np.asarray(kept_array(value) if isinstance(value, Kept) else value, np.float64)
-    except (AttributeError, IndexError, OverflowError, TypeError, ValueError):
-        array = None
-    if array is None or value is None:
+        array = np.asarray(kept_array(value) if isinstance(value, Kept) else value)
+    except (AttributeError, IndexError, TypeError, ValueError):
+        array = np.array(None)
+    if array.dtype.kind not in "biuf":
         refuse(where, f"{name} holds no numbers: record or download it again")
     if shape is not None and array.shape != shape:
         refuse(where, f"{name} has the shape {array.shape}, not {shape}: record it again")
-    return array
+    return array.astype(np.float64)
 
 
 def kept_array(kept: Kept) -> np.ndarray:
@@ -440,6 +443,8 @@ def read_depth(file: Path) -> np.ndarray:
     try:
         with PIL.Image.open(file) as image:
             pixels = np.asarray(image)
+    except PermissionError as error:
+        refuse(file, f"cannot be read: {error.strerror}")
     except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
         refuse(file, f"is damaged or no image: {' '.join(str(error).split())}; download it again")
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:

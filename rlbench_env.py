@@ -9,9 +9,9 @@ CoppeliaSim.
 
 The paper trains on 25 tasks and adapts to 5 others. It does not say which of a task's variations it
 uses; here a task is its first one. Demonstrations are imported, since RLBench plans whole paths and
-has no expert that acts step by step. All rollouts of a task hold the same demonstration, as in the
-paper. States, actions and clouds are those of rlbench_data.py, so that recordings and environment
-agree.
+has no expert that acts step by step. All rollouts of a task are shown the same
+demonstration, as in the paper. States, actions and clouds are those of rlbench_data.py, so that
+recordings and environment agree.
 
 The seed of an episode sets NumPy's global generator, from which RLBench draws where things are and
 which colours they have: the same seed draws the same start. There are two exceptions. RLBench draws
@@ -83,7 +83,7 @@ def check_installed() -> None:
 # ---- The simulator of a process ------------------------------------------------------------------
 
 # CoppeliaSim runs once in a process: the launched "environment", the "name" of the task that is
-# loaded, its "task", and "episode", whose episode it is.
+# loaded, its "task", and "episode", the RLBenchEnv that began last.
 running: dict[str, Any] = {}
 
 
@@ -183,7 +183,10 @@ class RLBenchEnv:
         return {"point_cloud": cloud, "agent_pos": self.state().astype(np.float32)}
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
-        """Takes one step. Returns (reward, truncated, info)."""
+        """Takes one step. Returns (reward, truncated, info).
+
+        Raises RuntimeError if another environment of this process has begun an episode since.
+        """
         from rlbench.backend.exceptions import InvalidActionError
 
         if running["episode"] is not self:

@@ -4,10 +4,10 @@
     python simulator.py --task shelf-place  # of one task
 
 What trains, adapts and evaluates a policy knows a simulator only by the two Protocols below,
-`Simulator` and `Environment`; rl.py needs states besides, see there. A new simulator is a file with
-a class that has their methods, and an entry in SIMULATORS for each of its suites of tasks. Its
-packages are imported only when one of its suites is asked for: own recordings are trained on
-without them.
+`Simulator` and `Environment`; rl.py also reads states of the simulator, see there. A new simulator
+is a file with a class that has their methods, and an entry in SIMULATORS for each of its suites of
+tasks. Its packages are imported only when one of its suites is asked for: own recordings are
+trained on without them.
 
 Letters: N points of an observation, S state dim, A action dim, T frames of an episode.
 """
@@ -90,7 +90,8 @@ class Simulator(Protocol):
     demonstrations: int  # of a task, unless a command says otherwise
     episode_steps: int  # after so many steps an episode is truncated
     # Two more may be left out. With `one_environment = True` a process uses one environment at a
-    # time, and with `one_demonstration = True` all rollouts of a task hold the same demonstration.
+    # time, and with `one_demonstration = True` all rollouts of a task are shown the same
+    # demonstration.
 
     def tasks(self, suite: str) -> tuple[list[str], list[str]]:
         """Returns a suite's (base, novel) tasks: those to train on, and those to adapt to."""
@@ -182,7 +183,7 @@ def environments_of(
     """Returns `number` environments of a task, whose clouds have `num_points` points.
 
     Environments of the previous call are used again, for another task if they can change to it. So
-    those must not be needed any more.
+    whoever asked for those must have finished with them.
     """
     environments = kept.environments
     kept.environments = []  # should anything fail below, none is kept

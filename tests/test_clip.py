@@ -348,6 +348,22 @@ def test_a_file_cut_off_is_refused(official, weights, tmp_path):
         load_clip_text_encoder(path)
 
 
+def test_a_zip_whose_table_of_contents_is_damaged_is_refused(tmp_path):
+    path = tmp_path / "damaged.pt"
+    torch.save({"text_projection": torch.zeros(2)}, path)
+    content = bytearray(path.read_bytes())
+    content[content.rindex(b"PK\x01\x02")] = 0  # of the table's last entry
+    path.write_bytes(content)
+    with pytest.raises(clip.TextWeightsError, match=r"damaged\.pt: .* or damaged"):
+        load_clip_text_encoder(path)
+
+
+def test_a_file_without_names_is_refused(tmp_path):
+    torch.save({0: torch.zeros(2)}, tmp_path / "numbers.pt")
+    with pytest.raises(clip.TextWeightsError, match="nor a plain state dict"):
+        load_clip_text_encoder(tmp_path / "numbers.pt")
+
+
 def test_a_missing_file_or_a_folder_is_refused(tmp_path):
     for path in (tmp_path / "none.pt", tmp_path):
         with pytest.raises(clip.TextWeightsError, match="there is no such file"):

@@ -138,6 +138,22 @@ def test_ctrl_c_ends_in_130_with_what_was_saved(capsys):
     assert ended(KeyboardInterrupt(), capsys)[1] == "interrupted\n"
 
 
+def test_a_reader_that_stops_reading_ends_a_script_without_a_word():
+    code = (
+        "from common import command_line; "
+        "command_line(lambda: [print('x' * 100, flush=True) for _ in range(100_000)])"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        process.stdout.readline()
+        process.stdout.close()  # as `| head -1` does
+        assert process.stderr.read() == b""
+    assert process.returncode == 1
+    with pytest.raises(BrokenPipeError):  # of something else, such as a robot's socket
+        command_line(lambda: (_ for _ in ()).throw(BrokenPipeError()))
+
+
 def test_threads_are_as_many_as_were_asked_for():
     before = torch.get_num_threads()
     try:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import report
 from data import Demonstrations
@@ -148,6 +149,16 @@ def test_a_chart_has_a_bar_for_each_column_and_task_with_its_interval(figures, t
     assert [text.get_text() for text in axes.get_xticklabels()] == ["a", "b"]
     lefts = [bar.get_x() for bar in axes.patches]
     assert len({round(left, 3) for left in lefts}) == len(lefts)  # side by side
+
+
+@pytest.mark.parametrize("number", [2, 6])
+def test_the_legend_of_a_chart_of_one_task_is_whole(number, figures, tmp_path):
+    columns = {f"goals-reach-small-seed0/ema-01500, {i}": {"a": [True]} for i in range(number)}
+    report.plot_success(columns, tmp_path / "x.png", "A title", {"paper, DAMI": {"a": 30.0}})
+    canvas = FigureCanvasAgg(figures[0])
+    canvas.draw()
+    legend = figures[0].legends[0].get_window_extent(canvas.get_renderer())
+    assert legend.x0 >= 0 and legend.x1 <= figures[0].bbox.x1 and legend.y1 <= figures[0].bbox.y1
 
 
 def test_parts_of_a_chart_have_names_and_a_line_between_them(figures, tmp_path):
