@@ -422,6 +422,12 @@ class StopRequest:
 worker: dict[str, Any] = {"progress": None}
 
 
+def check_workers(workers: int | None) -> None:
+    """Raises UserError for a number of processes below 1."""
+    if workers is not None and workers < 1:
+        raise UserError(f"--workers is {workers}: use at least 1")
+
+
 class WorkerPool:
     """Processes that call jobs, kept from one call of `run` to the next.
 
@@ -437,8 +443,7 @@ class WorkerPool:
     """
 
     def __init__(self, workers: int | None = None):
-        if workers is not None and workers < 1:
-            raise UserError(f"--workers is {workers}: use at least 1")
+        check_workers(workers)
         self.workers = workers or usable_cores()
         if sys.platform == "win32":
             self.workers = min(self.workers, 61)  # Python waits for no more of them there

@@ -83,10 +83,10 @@ class Demonstrations:
       1 or more can be augmented: points, positions and displacement turn and stretch together. An
       orientation in the state or the action turns with them where rotation_near_rad is there;
       otherwise it stays as it is, and so is wrong by up to 16 degrees.
-    - rotation_near_rad: three numbers, where positions_in_state is 1 and the next three numbers of
-      a state are a rotation vector in the frame of the points, of its two forms the nearer to this
-      one; those of an action are a rotation in that frame, applied after the present one. robot.py
-      records so.
+    - rotation_near_rad: three numbers, radians. Numbers 4 to 6 of a state are then a rotation
+      vector in the frame of the points: of the two vectors that describe one rotation, the nearer
+      to this one. Numbers 4 to 6 of an action are a rotation vector in that frame, applied after
+      the present rotation. It is ignored unless positions_in_state is 1. robot.py records so.
     - success_frames: the frame of each episode's first success, counted from the episode's start.
     - workspace: two opposite corners of the box that holds the points, metres.
     - simulator: the name of the simulator that they were made in; own recordings have none.
@@ -128,7 +128,8 @@ class Demonstrations:
         return self.meta.get("action_names", [f"action[{place}]" for place in places])
 
     def episode(self, index: int) -> slice:
-        """The frames of one episode."""
+        """The frames of one episode; a negative index counts from the end."""
+        index = range(len(self))[index]  # IndexError where there is no such episode
         ends = [0, *self.episode_ends.tolist()]
         return slice(ends[index], ends[index + 1])
 
@@ -341,7 +342,8 @@ def hold_out(
         return demonstrations, None
     if not 0 < n < len(demonstrations):
         raise RecordingError(
-            f"{demonstrations.task} has {len(demonstrations)} episodes: hold out fewer than that"
+            f"{demonstrations.task}: {n} of {len(demonstrations)} episodes cannot be held out, at "
+            "least one must be left to train on"
         )
     kept = len(demonstrations) - n
     return demonstrations.part(0, kept), demonstrations.part(kept, len(demonstrations))
@@ -653,10 +655,11 @@ def nearest_rotations(a: Tensor) -> Tensor:
 
 
 def turn_rotation_vectors(rotvec: Tensor, turn: Tensor, near: Tensor) -> Tensor:
-    """Rotation vectors (n, L, 3), then n further rotations (n, 3, 3) -> rotation vectors (n, L, 3).
+    """Turns the rotations of rotation vectors (n, L, 3) further by rotations (n, 3, 3).
 
-    By quaternions (w, x, y, z). A rotation has two vectors, of an angle v and, about the same axis,
-    of v - 2 pi. The one nearer to `near` (3,) is returned. A turn must be by less than half a turn.
+    It returns rotation vectors (n, L, 3), and calculates by quaternions (w, x, y, z). A rotation
+    has two vectors, of an angle v and, about the same axis, of v - 2 pi. The one nearer to `near`
+    (3,) is returned. Each turn must be by less than 180 degrees.
     """
     w = (1 + turn.diagonal(dim1=-2, dim2=-1).sum(-1)).sqrt() / 2  # (n,)
     skew = turn - turn.mT
@@ -873,10 +876,10 @@ class WindowSampler:
         }
 
     def batch(self, n: int, generator: torch.Generator, support: int = 0) -> dict[str, Tensor]:
-        """Draws a reference demonstration, and n windows of other episodes where there are any.
+        """Draws a reference demonstration, and n windows of other episodes if there are any.
 
-        The first `support` windows are of other episodes than the rest, where there are enough.
-        Were they of the same ones, an inner step could lower the loss of the rest by memory.
+        With three or more episodes, the first `support` windows also come from other episodes than
+        the rest. Otherwise an inner step could lower the loss of the rest by memory.
         """
         reference = self.sample_episode(generator)
         demo = self.demonstration(reference)

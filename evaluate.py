@@ -67,6 +67,7 @@ from simulator import (
     Simulator,
     check_task,
     collect,
+    draw_base_tasks,
     environments_of,
     evaluation_seed,
     simulator_of,
@@ -126,6 +127,11 @@ def rate_of_checkpoint(
     if not learned:
         return info["arguments"]["inner_lr"]
     return {name: torch.tensor(rate, device=device) for name, rate in learned.items()}
+
+
+def inner_seed(seed: int, task: str) -> int:
+    """The seed of the windows and the noise of inner steps: each task has draws of its own."""
+    return zlib.crc32(f"{seed} {task}".encode())
 
 
 def take_inner_steps(
@@ -565,7 +571,7 @@ def evaluate_checkpoint(
             inner_steps=inner_steps,
             inner_lr=inner_lr,
             support=support,
-            inner_seed=zlib.crc32(f"{seed} {task}".encode()),  # each task has draws of its own
+            inner_seed=inner_seed(seed, task),
         )
         for start in range(0, len(seeds), episodes_a_job):
             jobs.append(
@@ -1037,6 +1043,8 @@ def check_flags(args: argparse.Namespace) -> None:
     ):
         if value is not None and value < least:
             raise UserError(f"--{name} is {value}: use at least {least}")
+    if args.suite not in (None, "own"):
+        simulator_of(args.suite)  # refuses what there is none of
     evaluation_seed(args.seed, args.episodes - 1)  # refuses what is out of range
     for name, value in (("inner-lr", args.inner_lr), ("support", args.support)):
         if value is not None and args.inner_steps == 0:
@@ -1081,8 +1089,9 @@ class Checkpoint:
 def choose_checkpoints(
     paths: Sequence[str | Path], top: int, config_overrides: dict[str, Any]
 ) -> list[list[Checkpoint]]:
-    """Of each run the checkpoints to measure: the last one, or all of them, the last one last.
+    """Of each run the checkpoints to measure, in the order of their steps.
 
+    Those are all of a run's, or the last one alone where `top` is 0.
     Raises UserError for a run of fewer than `top` checkpoints, and for two of one label.
     """
     runs = []
@@ -1104,9 +1113,13 @@ def choose_checkpoints(
 
 
 def choose_tasks(
-    args: argparse.Namespace, simulator: Simulator, suite: str, adapted_to: str | None
+    args: argparse.Namespace, simulator: Simulator, suite: str, info: dict[str, Any]
 ) -> list[str]:
-    """The tasks to measure: --task, the one a policy was adapted to, or those of the split."""
+    """The tasks to measure: --task, the one a policy was adapted to, or those of the split.
+
+    `info` is the checkpoint's. Base tasks of its own suite are those that it was trained on.
+    """
+    adapted_to = info.get("adapted_to")
     named = list(dict.fromkeys(args.task or []))  # each once
     if named and adapted_to and named != [adapted_to]:
         raise UserError(f"this policy was adapted to {adapted_to}, not to {' '.join(named)}")
@@ -1118,6 +1131,9 @@ def choose_tasks(
     base, novel = simulator.tasks(suite)
     if args.split == "novel" and not novel:
         raise UserError(f"--split novel: {suite} has no novel tasks")
+    training = info["arguments"]
+    if suite == info["suite"] and training.get("base_tasks") is not None:
+        base = draw_base_tasks(base, training["base_tasks"], training["seed"])
     return {"base": base, "novel": novel, "all": [*base, *novel]}[args.split]
 
 
@@ -1365,7 +1381,7 @@ def main(argv: list[str] | None = None) -> None:
     simulator = simulator_of(suite)
     if args.demonstrations is None:
         args.demonstrations = simulator.demonstrations
-    tasks = choose_tasks(args, simulator, suite, info.get("adapted_to"))
+    tasks = choose_tasks(args, simulator, suite, info)
     check_together(list(chain(*runs)), tasks)
     if args.swap and len(tasks) < 2:
         raise UserError(

@@ -120,8 +120,8 @@ def adapt_policy(
         seed: of batches, demonstrations and noise.
 
     Yields:
-        (steps done, loss, the moving average of the adapted policy) after each step. The average is
-        always the same object.
+        After each step: (steps done, the loss of the step's batch before that step, the moving
+        average of the adapted policy). The average is always the same object.
 
     Raises:
         UserError: the loss is not finite.
@@ -298,7 +298,7 @@ class Adaptation:
                 steps=settings.inner_steps,
                 batch=settings.batch,
                 lr=evaluate.rate_of_checkpoint(info, text.device, settings.inner_lr),
-                seed=settings.seed,
+                seed=evaluate.inner_seed(settings.seed, demonstrations.task),
             )
         seconds = 0.0
         began = time.monotonic()
@@ -426,7 +426,7 @@ def choose_checkpoint(args: argparse.Namespace, simulated: bool) -> Path:
     """The policy to start from: --checkpoint, or that of the newest run on the suite."""
     if args.checkpoint is not None:
         return evaluate.checkpoints_of(args.checkpoint)[-1]
-    return evaluate.default_checkpoint((args.suite or "ml10") if simulated else "own")
+    return evaluate.default_checkpoint(args.suite or ("ml10" if simulated else "own"))
 
 
 def choose_tasks(names: Sequence[str], simulator: Simulator, suite: str) -> list[str]:
@@ -546,6 +546,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parse(argv)
     settings = common.with_flags(Settings(), args)
     check_flags(args, settings)
+    common.check_workers(args.workers)
     device = common.pick_device(args.device, args.threads)
 
     # A recording in a file, one's own or a simulator's; or tasks of a simulator to collect
@@ -586,6 +587,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     folders = {task: out / task if several else out for task in tasks}
 
     with common.locked(out):
+        if args.resume and (out / "adapted.pt").exists():
+            raise UserError(f"{out} holds the policy of one task: choose another --out")
         if recording is None:
             paths = {task: Path(args.data) / f"{task}.npz" for task in tasks}
         else:

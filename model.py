@@ -707,7 +707,8 @@ class DAMIPolicy(nn.Module):
                 (D, T, N, P) in metres, (D, T, S), (D, T, A).
 
         Returns:
-            What `loss` and `sample_actions` condition on.
+            A tuple of tensors whose first axis is D, for `sample_actions`; None where the policy
+            reads no task. `loss` takes the inputs themselves.
 
         Raises:
             ValueError: an input is missing or has a wrong shape, or a demonstration has more frames
@@ -858,7 +859,10 @@ class DAMIPolicy(nn.Module):
                 raise ValueError(f"{name} is {found}, the policy takes {takes}{advice}")
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
-        """Draws what makes `loss` pure: noise (n, H, A) and timesteps (n,) int64."""
+        """Draws what makes `loss` pure: noise (n, H, A) float32 and timesteps (n,) int64.
+
+        They are on the policy's device, whatever the generator's.
+        """
         H, A, K = self.config.horizon, self.config.action_dim, self.config.diffusion_steps
         source, device = generator.device, self.normalizer.action_scale.device
         noise = torch.randn(n, H, A, generator=generator, device=source)

@@ -237,6 +237,15 @@ def seeds_of_a_task(simulator: Simulator) -> int:
     return EPISODE_SEEDS // len(simulator.instructions)
 
 
+def draw_base_tasks(base_tasks: Sequence[str], n: int | None, seed: int) -> list[str]:
+    """Returns the tasks to train on, in their order: n of them that the seed draws; None: all."""
+    n = len(base_tasks) if n is None else n
+    if n > len(base_tasks):
+        raise UserError(f"--base-tasks is {n}: there are {len(base_tasks)}, use at most that")
+    drawn = np.random.default_rng(seed).choice(len(base_tasks), n, replace=False)
+    return [base_tasks[i] for i in sorted(drawn)]
+
+
 def demonstration_seed(simulator: Simulator, task: str, seed: int, attempt: int) -> int:
     """Returns the episode seed of one attempt at a demonstration, below 10**8.
 

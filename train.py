@@ -65,7 +65,14 @@ from data import (
 from maml import InnerRate, meta_gradient
 from model import TASK_INPUTS, CheckpointError, DAMIPolicy, PolicyConfig, ema_model, split
 from report import Outcomes
-from simulator import SIMULATORS, Simulator, collect, made_by_simulator, simulator_of
+from simulator import (
+    SIMULATORS,
+    Simulator,
+    collect,
+    draw_base_tasks,
+    made_by_simulator,
+    simulator_of,
+)
 
 # ---- Settings ------------------------------------------------------------------------------------
 
@@ -568,7 +575,10 @@ def restore(
         needs=(*evaluate.TRAINED, "training", "recordings", "provenance"),
     )
 
-    settings_then = Settings(**info["arguments"])  # newer fields take their defaults
+    try:
+        settings_then = Settings(**info["arguments"])  # newer fields take their defaults
+    except TypeError as error:
+        raise UserError(f"{path} is of another version of the code: {error}") from error
     may_differ = set(FREE_TO_CHANGE)
     if info["step"] <= min(settings.pretrain_steps, settings_then.pretrain_steps):
         may_differ.update(OF_INNER_STEP)
@@ -821,13 +831,17 @@ def heldout_controls(
             lr=inner_lr,
             seed=zlib.crc32(task.encode()),  # each task has draws of its own
         )
-        for step, _, adapted in of_each_step:
-            if step in measured:
-                measured[step][task] = evaluate.action_error(
-                    adapted, sampler, heldout_sampler, text[task]
-                )
+        try:
+            for step, _, adapted in of_each_step:
+                if step in measured:
+                    measured[step][task] = evaluate.action_error(
+                        adapted, sampler, heldout_sampler, text[task]
+                    )
+        except UserError as error:  # of five steps, where training took one
+            print(f"{task} cannot be measured after so many: {error}", flush=True)
     for step, of_tasks in measured.items():
-        rows[f"after {common.count(step, 'inner step')}"] = mean_of_tasks(of_tasks)
+        if len(of_tasks) == len(heldout_samplers):
+            rows[f"after {common.count(step, 'inner step')}"] = mean_of_tasks(of_tasks)
     return rows
 
 
@@ -859,7 +873,7 @@ def report_training(
         )
         print(f"\n{table}")
     if (folder / "held-out.md").exists():
-        print(f"\n{(folder / 'held-out.md').read_text().rstrip()}")
+        print(f"\n{(folder / 'held-out.md').read_text(encoding='utf-8').rstrip()}")
 
     files = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     print(f"\n{folder} is finished: {', '.join(files)}")
@@ -939,33 +953,21 @@ def choose_architecture(args: argparse.Namespace, preset: str) -> PolicyConfig:
     config = baselines.PRESETS[args.policy or "dami"][preset]
     try:
         config = replace(config, **{name: x for name, x in flags.items() if x is not None})
-        model.POLICIES[config.policy].check_config(config)
+        with torch.device("meta"):  # which takes no memory
+            model.build_policy(config)  # refuses what does not fit
     except ValueError as error:
         raise UserError(str(error)) from error
     return config
 
 
-def draw_base_tasks(base_tasks: Sequence[str], settings: Settings) -> list[str]:
-    """The tasks to train on: all of a suite's base tasks, or as many as the settings say."""
-    n = len(base_tasks) if settings.base_tasks is None else settings.base_tasks
-    if n > len(base_tasks):
-        raise UserError(
-            f"--base-tasks is {n}: {settings.suite} has {len(base_tasks)}, use at most that"
-        )
-    drawn = np.random.default_rng(settings.seed).choice(len(base_tasks), n, replace=False)
-    return [base_tasks[i] for i in sorted(drawn)]
-
-
-def choose_settings(
-    args: argparse.Namespace, preset: str, suite: str, config: PolicyConfig
-) -> Settings:
-    """The preset's settings, with the flags that were given."""
+def default_settings(preset: str, suite: str, config: PolicyConfig) -> Settings:
+    """A preset's settings on a suite for an architecture."""
     settings = preset_settings(preset, suite)
     if suite == "own":  # all demonstrations, and no simulator to be rolled out in
         settings = replace(settings, demonstrations=None, episodes=0)
     if config.demo_encoder == "none":  # then the instruction alone tells the task
         settings = replace(settings, instruction_dropout=0.0, task_dropout=0.0)
-    return common.with_flags(settings, args)
+    return settings
 
 
 def fit_to_recordings(
@@ -1023,6 +1025,13 @@ def check_folder(folder: Path, resume: bool) -> None:
         raise UserError(f"{folder} already holds a run: add --resume, or another --out")
 
 
+def any_process(flag: bool, device: torch.device) -> bool:
+    """Whether the flag is set in any of torchrun's processes, which all ask at the same step."""
+    of_all = torch.tensor(float(flag), device=device)
+    dist.all_reduce(of_all, op=dist.ReduceOp.MAX)
+    return of_all.item() > 0
+
+
 def begin_files(
     folder: Path, step: int, settings: Settings, config: PolicyConfig, provenance: dict[str, Any]
 ) -> None:
@@ -1031,10 +1040,11 @@ def begin_files(
     It also prints the settings of a new run, or where an old one goes on.
     """
     if step == 0:
-        default = baselines.PRESETS[config.policy][settings.preset]
+        default_config = baselines.PRESETS[config.policy][settings.preset]
+        default = default_settings(settings.preset, settings.suite, config)
         common.print_settings(
             used={**asdict(settings), **asdict(config)},
-            default={**asdict(preset_settings(settings.preset, settings.suite)), **asdict(default)},
+            default={**asdict(default), **asdict(default_config)},
         )
     else:
         print(f"going on after step {step} of {settings.steps}", flush=True)
@@ -1184,6 +1194,8 @@ def run(
                         )
                     report.plot_curves(folder)
             stopping = stop.requested  # read once: a signal from now on is served a step later
+            if world > 1:
+                stopping = any_process(stopping, device)
             if rank == 0 and (milestone or stopping or saver.is_due()):
                 saver.save(state)
             if stopping:
@@ -1212,14 +1224,18 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     # Own recordings, or the base tasks of a suite
     simulator = None if own else simulator_of(suite)
-    settings = choose_settings(args, preset, suite, config)
+    settings = common.with_flags(default_settings(preset, suite, config), args)
+    common.check_workers(args.workers)
     novel_paths = {}  # of tasks that are not trained on, if they are evaluated on
     if own:
-        paths = own_recordings(Path(args.data))
+        recorded = own_recordings(Path(args.data))
+        trained = draw_base_tasks(list(recorded), settings.base_tasks, settings.seed)
+        paths = {task: recorded[task] for task in trained}
     else:
         base_tasks, novel_tasks = simulator.tasks(suite)
         data = Path(args.data or "data")
-        paths = {task: data / f"{task}.npz" for task in draw_base_tasks(base_tasks, settings)}
+        trained = draw_base_tasks(base_tasks, settings.base_tasks, settings.seed)
+        paths = {task: data / f"{task}.npz" for task in trained}
         if settings.evaluate_on == "novel" and not novel_tasks:
             raise UserError(f"--evaluate-on novel: {suite} has no novel tasks")
         if settings.evaluate_on == "novel" and settings.episodes > 0:
@@ -1252,7 +1268,10 @@ def main(argv: Sequence[str] | None = None) -> None:
             paths=paths,
             evaluated_paths=novel_paths or paths,
             folder=folder,
-            provenance=common.provenance("train.py", argv, device),
+            provenance={
+                **common.provenance("train.py", argv, device),
+                **({"processes of torchrun": world} if world > 1 else {}),
+            },
             device=device,
             rank=rank,
             world=world,

@@ -167,13 +167,22 @@ def test_the_last_episodes_are_held_out():
         part.check()
 
 
+def test_an_episode_is_counted_from_either_end():
+    recorded = recording((50, 7, 120))
+    assert recorded.episode(0) == recorded.episode(-3) == slice(0, 50)
+    assert recorded.episode(-1) == recorded.episode(2) == slice(57, 177)
+    for index in (3, -4):
+        with pytest.raises(IndexError):
+            recorded.episode(index)
+
+
 def test_no_episode_or_all_but_one_can_be_held_out():
     recorded = recording((50, 7, 120))
     kept, heldout = data.hold_out(recorded, 0)
     assert len(kept) == 3 and heldout is None
     assert [len(part) for part in data.hold_out(recorded, 2)] == [1, 2]
     for n in (3, 4, -1):
-        with pytest.raises(RecordingError, match="reach has 3 episodes: hold out fewer than that"):
+        with pytest.raises(RecordingError, match=f"reach: {n} of 3 episodes cannot be held out"):
             data.hold_out(recorded, n)
 
 

@@ -717,6 +717,16 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
     assert "mean, last checkpoint: " in printed
 
 
+def test_base_tasks_are_those_that_the_policy_was_trained_on(run, recordings):
+    content = torch.load(run / "ema-00006.pt", weights_only=True)
+    content["arguments"] |= {"base_tasks": 1, "seed": 0}
+    torch.save(content, run / "ema-00006.pt")
+    evaluate.main(command(run, recordings, "--episodes 1 --out report"))
+    [trained] = simulator.draw_base_tasks(TASKS, 1, seed=0)
+    [measured] = report_of("report")["successes"].values()
+    assert list(measured) == [trained]
+
+
 def test_the_best_checkpoints_of_a_run_are_averaged(run, recordings, monkeypatch, capsys):
     def measured(checkpoint, recordings, **_):
         of_tasks = {task: [checkpoint.stem == "ema-00003", True] for task in recordings}
@@ -998,6 +1008,7 @@ def test_a_movie_is_written_by_what_is_there(monkeypatch):
         ("--seed 1000", "seed 1000 is out of range"),
         ("--task touch-rd", "did you mean 'touch-red'?"),
         ("--suite ml-45", "did you mean 'ml45'?"),
+        ("--suite goals-raech", "did you mean 'goals-reach'?"),
         ("--n-action-steps 99", "cannot be used like this: n_action_steps is 99"),
         ("--support 3", "--support is for --inner-steps: give both"),
         ("--inner-lr 0.1", "--inner-lr is for --inner-steps: give both"),

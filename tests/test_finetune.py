@@ -415,7 +415,9 @@ REFUSED = {
     "--data own.npz --task shelf-place": "no finished run on own",
     "--data own.npz --checkpoint {run} --task reach": "is a recording of stir, not of reach",
     "--data own.npz --checkpoint {run} --demonstrations 3": "3 demonstrations of stir asked for",
-    "--data own.npz --checkpoint {run} --held-out 2": "has 2 episodes",
+    "--data own.npz --checkpoint {run} --held-out 2": "stir: 2 of 2 episodes cannot be held out",
+    "--data own.npz --suite ml10": "stir has 64 points a cloud, the policy 128",
+    "--task shelf-place --workers 0": "--workers is 0: use at least 1",
     "--data long.npz --checkpoint {run}": "has 11 frames (one in 20), the policy 10 positions",
     "--data wide.npz --checkpoint {run}": "has 7 numbers an action, the policy 4: use",
     "--data none.npz --checkpoint {run}": "holds no episodes",
@@ -466,6 +468,17 @@ def test_an_adaptation_that_diverges_stops_and_writes_no_policy(run, recorded, c
     message = fails(finetune, [*argv, "--steps", "20"], capsys)
     assert "door-close: the loss is not finite at step" in message
     assert not list(Path().rglob("adapted.pt"))
+
+
+def test_resuming_several_tasks_removes_no_policy_of_one(run, recorded, capsys):
+    argv = adapting(run, recorded, "--episodes 0 --out one")
+    finetune.main(argv)
+    before = fingerprint(Path("one"))
+    several = adapting(run, recorded, "--episodes 0 --out one --resume", "door-close reach")
+    assert "one holds the policy of one task: choose another --out" in fails(
+        finetune, several, capsys
+    )
+    assert fingerprint(Path("one")) == before
 
 
 def test_a_folder_in_use_is_not_written_into(run, recorded, capsys):

@@ -208,12 +208,12 @@ def test_the_tasks_of_a_step_and_of_a_training_follow_from_the_seed():
         assert train.tasks_of_step(7, 10, replace(settings, tasks_per_step=every)) == [*range(10)]
 
     names = [f"task-{i}" for i in range(10)]
-    drawn = [train.draw_base_tasks(names, train.Settings(seed=s, base_tasks=4)) for s in range(5)]
+    drawn = [simulator.draw_base_tasks(names, 4, seed) for seed in range(5)]
     assert all(len(set(of)) == 4 and of == sorted(of) for of in drawn)
     assert len({tuple(of) for of in drawn}) == 5
-    assert train.draw_base_tasks(names, train.Settings()) == names
-    with pytest.raises(common.UserError, match="--base-tasks is 11: ml10 has 10"):
-        train.draw_base_tasks(names, train.Settings(base_tasks=11))
+    assert simulator.draw_base_tasks(names, None, seed=0) == names
+    with pytest.raises(common.UserError, match="--base-tasks is 11: there are 10"):
+        simulator.draw_base_tasks(names, 11, seed=0)
 
 
 def test_the_world_in_which_weights_are_frozen_trains_rates_alone(monkeypatch):
@@ -408,13 +408,12 @@ FLAGS = (
     *("--augment", "--after-success 3", "--seed 1", "--inner-lr 0.5", "--lr 1", "--support 5"),
     *("--query 9", "--instruction-dropout 1", "--task-dropout 1", "--maml first", "--maml off"),
     *("--maml off --bfloat16", "--augment --one-map", "--after-success 3 --late-fraction 0.5"),
-    *("--warmup 1", "--tasks-per-step 1", "--demonstrations 1"),
+    *("--warmup 1", "--tasks-per-step 1", "--demonstrations 1", "--base-tasks 1"),
 )
 # What the first step does not show
 LATER = {
     *("steps", "checkpoint_every", "evaluate_every", "episodes", "evaluate_on", "held_out"),
     *("pretrain_fraction", "vectorize", "learn_inner_lr", "rate_lr", "suite", "preset"),
-    "base_tasks",  # of own recordings all are trained on
 }
 
 
@@ -686,7 +685,7 @@ def test_every_way_of_training_has_a_gradient_of_its_own(pair, tmp_path):
 def dropout_settings(options):
     args = train.parse(["--preset", "small", *options.split()])
     config = train.choose_architecture(args, "small")
-    settings = train.choose_settings(args, "small", "ml10", config)
+    settings = common.with_flags(train.default_settings("small", "ml10", config), args)
     return settings.instruction_dropout, settings.task_dropout
 
 
@@ -808,6 +807,16 @@ def test_inner_steps_on_held_out_episodes_are_taken_with_the_learned_rates(pair,
         assert {name: rate.item() for name, rate in lr.items()} == rates
 
 
+def test_inner_steps_that_go_too_far_do_not_cost_the_training(pair, capsys):
+    """Of five steps on held-out episodes, where the training took one."""
+    options = "--steps 2 --held-out 1 --inner-lr 1e3 --out run".split()
+    train.main([*SHORT, "--data", str(pair), *options])
+    assert Path("run/last.pt").exists()
+    assert "cannot be measured after so many: " in capsys.readouterr().out
+    table = Path("run/held-out.md").read_text()
+    assert "after 5 inner steps" not in table and "the mean action" in table
+
+
 # ---- Resuming ------------------------------------------------------------------------------------
 
 
@@ -839,6 +848,11 @@ def test_a_run_that_was_begun_before_a_setting_existed_is_resumed(resumable, tmp
     torch.save(last, tmp_path / "run" / "last.pt")
     train.main(resumable)
     assert "held_out 0 -> 1" in fails(train, [*resumable, "--held-out", "1"], capsys)
+
+
+def test_a_run_of_another_version_is_refused_in_one_line(resumable, tmp_path, capsys):
+    edit_last(tmp_path / "run", a_setting_that_is_gone=1)
+    assert "last.pt is of another version of the code" in fails(train, resumable, capsys)
 
 
 def test_what_concerns_the_inner_step_may_differ_before_the_first_one(resumable, tmp_path, capsys):
@@ -1021,7 +1035,7 @@ def test_held_out_episodes_are_only_for_measuring(pair, capsys, monkeypatch):
     assert errors[1] == errors[2]  # both recordings hold the same episodes
     assert len(errors) == 6 and len(set(errors)) == 5  # else another policy, or another input
     message = fails(train, [*argv, "--out", "runs/none", "--held-out", "2"], capsys)
-    assert "has 2 episodes" in message
+    assert "2 of 2 episodes cannot be held out" in message
 
 
 # ---- Bad input -----------------------------------------------------------------------------------
@@ -1033,6 +1047,9 @@ REFUSED = {
     "--demonstrations 0": "--demonstrations is 0: use at least 1",
     "--demonstrations 3": "3 demonstrations of pour asked for, there are 2",
     "--threads 0": "--threads is 0: use at least 1",
+    "--workers 0": "--workers is 0: use at least 1",
+    "--base-tasks 3": "--base-tasks is 3: there are 2, use at most that",
+    "--denoiser frequency-transformer": "is the denoiser of freq, not dami",
     "--num-points 0": "num_points is 0: use whole numbers from 1 to",
     "--num-points 65": "pour has 64 points a cloud, the policy 65",
     "--policy flow --tcfm down": "policy flow needs tcfm 'none', not 'down'",
