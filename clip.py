@@ -326,7 +326,7 @@ def read_clip_file(path: Path) -> CLIPTextEncoder:
         try:
             with zipfile.ZipFile(path) as archive:
                 names = archive.namelist()
-        except Exception:  # of many types; a zip's table of contents stands at its end
+        except Exception:  # zipfile raises many types; a zip's table of contents is at its end
             size = path.stat().st_size
             raise TextWeightsError(
                 f"{path}: the file is cut off after {size} bytes, or damaged; fetch it again"

@@ -170,7 +170,9 @@ def command_line(main: Callable[[], None], errors: tuple[type[Exception], ...] =
     except BrokenPipeError:
         if not nobody_reads_the_output():
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left is lost
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # for what is still unwritten
         sys.exit(1)
     except Exception as error:
         line, code = describe_user_error(error, errors), 2
