@@ -838,7 +838,7 @@ def heldout_controls(
                         adapted, sampler, heldout_sampler, text[task]
                     )
         except UserError as error:  # of five steps, where training took one
-            print(f"inner steps on {task} were given up: {error}", flush=True)
+            print(f"inner steps were given up, {error}", flush=True)
     for step, of_tasks in measured.items():
         if len(of_tasks) == len(heldout_samplers):
             rows[f"after {common.count(step, 'inner step')}"] = mean_of_tasks(of_tasks)
