@@ -21,10 +21,10 @@ observation.state, action and either a cloud or depth: an array, a TIFF, or a 12
 **HDF5** of robomimic (data/demo_0 ...) and ManiSkill (traj_0 ...): actions, arrays that --state
 names, and a cloud or depth.
 
-**RLBench**: a data set, a task or a variation, as `rlbench-generate-dataset` writes them, and what
-is called `all_variations`. Points, states and actions are those of rlbench_data.py. A recording is
-named by its task, and those of a task's further variations by `TASK-variation1`. Episodes are
-counted through all folders, in their order.
+**RLBench**: a data set, a task or a variation, as `rlbench-generate-dataset` writes them, with
+folders `variation0` or `all_variations`. Points, states and actions are those of rlbench_data.py. A
+recording is named by its task, and those of a task's further variations by `TASK-variation1`.
+Episodes are counted through all folders, in their order.
 
 A cloud is (N, 3 or more), (3 or more, N) or an image (H, W, 3 or more) of positions in metres.
 Depth (H, W) needs its unit and the camera's intrinsics, from the data set or from --camera, see
@@ -39,6 +39,7 @@ import io
 import json
 import math
 import re
+import warnings
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -54,6 +55,7 @@ import numpy as np
 import rlbench_data
 from common import UserError, command_line, progress_bar
 from data import (
+    NAME,
     Demonstrations,
     RecordingError,
     farthest_point_sample,
@@ -62,7 +64,7 @@ from data import (
     suspicions,
 )
 from report import plot_demonstration
-from robot import depth_to_points, has_depth, is_pose, thin
+from robot import depth_to_points, has_depth, is_pose, thin, transform
 
 
 def refuse(path: Any, problem: str) -> NoReturn:
@@ -103,7 +105,7 @@ def package(name: str, path: Path) -> Any:
 
 def read_json(path: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text()))
+        return dict(json.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
         refuse(path, f"cannot be read: {error.strerror}")
     except (TypeError, ValueError) as error:
@@ -160,12 +162,6 @@ class Camera:
         return points[inside.all(axis=1)]
 
 
-def transform(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Moves the positions of points (M, P) by a pose (4, 4)."""
-    xyz = points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
-    return np.concatenate([xyz, points[:, 3:]], axis=1).astype(np.float32)
-
-
 @dataclass(frozen=True)
 class Options:
     """What the command line says about a source."""
@@ -192,6 +188,21 @@ class Frame:
     action: np.ndarray  # (A,)
     cloud: Callable[[], np.ndarray]  # makes (M, P); positions may be NaN, colors stand in 3 to 5
     name: str | None = None  # of the task; None: it is made of the instruction
+
+
+def unread_episode(episode: int) -> Frame:
+    """One frame in the place of an episode that --skip names, so that the episode is counted."""
+    nothing = np.zeros(0)
+    return Frame(
+        episode=episode,
+        index=None,
+        time=None,
+        task=0,
+        instruction=None,
+        state=nothing,
+        action=nothing,
+        cloud=lambda: nothing,
+    )
 
 
 @dataclass(frozen=True)
@@ -250,8 +261,15 @@ def depth_cloud(
     """Depth (H, W), in units of `scale` metres, -> the points of the pixels that have depth.
 
     `color` (H, W, 3) is that of the same pixels, `pose` (4, 4) that of the camera. Returns (M, 3),
-    or (M, 6) with colors.
+    or (M, 6) with colors. Warns of intrinsics that seem to be of another resolution.
     """
+    if is_off_center(intrinsics, depth):
+        H, W = depth.shape
+        warnings.warn(  # Python shows it once
+            f"the principal point, {intrinsics[2]:g}, {intrinsics[3]:g}, is far from the middle of "
+            f"the depth, {W} x {H}: are the intrinsics of --camera those of this resolution?",
+            stacklevel=1,
+        )
     metres = depth.astype(np.float32) * np.float32(scale)
     points = depth_to_points(metres, intrinsics)
     if color is not None:
@@ -328,6 +346,13 @@ def of_same_camera(path: Path, depth: str, found: list[str]) -> str | None:
     return chosen[0]
 
 
+def is_off_center(intrinsics: list[float], depth: np.ndarray) -> bool:
+    """Whether the principal point is far from the middle of the depth (H, W)."""
+    H, W = depth.shape
+    cx, cy = intrinsics[2:]
+    return abs(cx - W / 2) >= W / 4 or abs(cy - H / 2) >= H / 4
+
+
 def intrinsics_of(path: Path, name: str, intrinsics: np.ndarray, depth: np.ndarray) -> list[float]:
     """fx, fy, cx, cy of four numbers or a matrix (3, 3), of the camera that saw `depth` (H, W).
 
@@ -343,13 +368,12 @@ def intrinsics_of(path: Path, name: str, intrinsics: np.ndarray, depth: np.ndarr
         Camera(intrinsics=numbers)
     except ValueError as error:
         refuse(path, f"{name} holds no intrinsics; {error}")
-    H, W = depth.shape
-    cx, cy = numbers[2:]
-    if abs(cx - W / 2) >= W / 4 or abs(cy - H / 2) >= H / 4:
+    if is_off_center(numbers, depth):
+        H, W = depth.shape
         refuse(
             path,
-            f"{name} has its principal point at {cx:g}, {cy:g}, far from the middle of the depth, "
-            f"{W} x {H}: if it is right, write fx, fy, cx, cy to --camera",
+            f"{name} has its principal point at {numbers[2]:g}, {numbers[3]:g}, far from the "
+            f"middle of the depth, {W} x {H}: if it is right, write fx, fy, cx, cy to --camera",
         )
     return numbers
 
@@ -819,7 +843,8 @@ def natural(file: Path) -> list[int]:
 def read_all_json_lines(path: Path) -> list[dict[str, Any]]:
     """The objects of a file, one a line; RecordingError where a line is none."""
     try:
-        return [dict(json.loads(line)) for line in path.read_text().splitlines() if line.strip()]
+        lines = path.read_text(encoding="utf-8").splitlines()
+        return [dict(json.loads(line)) for line in lines if line.strip()]
     except (TypeError, ValueError) as error:
         refuse_damaged(path, error, "no JSON, line by line")
 
@@ -929,13 +954,16 @@ def read_hdf5(path: Path, options: Options) -> Source:
     groups = dict(sorted(groups.items()))
     if not groups:
         refuse(path, f"holds no data/demo_0 or traj_0; it holds {', '.join(file)}")
-    first = hdf5_arrays(path, next(iter(groups.values())))
+    kept = [group for episode, group in groups.items() if episode not in options.skip]
+    if not kept:
+        refuse(path, "--skip leaves no episode")
+    first = hdf5_arrays(path, kept[0])
     if "actions" not in first:
         refuse(path, f"it lacks actions; an episode holds {', '.join(first)}")
     data = HDF5(path, first, options)
     longer = len(first[data.cloud]) == len(first["actions"]) + 1
     return Source(
-        frames=data.frames(groups, libero_instruction(parent)),
+        frames=data.frames(groups, libero_instruction(parent), options.skip),
         total_frames=hdf5_count(parent, "total"),
         lengths=hdf5_lengths(path, groups),
         unread=tuple(name for name in first if name not in data.read),
@@ -991,7 +1019,7 @@ def libero_instruction(group: Any) -> str | None:
 
 
 class HDF5:
-    """Reads frames of demonstrations. The first of them decides which arrays are read."""
+    """Reads frames of demonstrations. The first one's arrays decide which are read."""
 
     def __init__(self, path: Path, first: dict[str, Any], options: Options) -> None:
         self.path, self.camera = path, options.camera
@@ -1052,15 +1080,24 @@ class HDF5:
         found = [name for name in first if kind in name.rpartition("/")[2]]
         return of_same_camera(self.path, self.cloud, found)
 
-    def frames(self, groups: dict[int, Any], instruction: str | None) -> Iterator[Frame]:
+    def frames(
+        self, groups: dict[int, Any], instruction: str | None, skip: frozenset[int]
+    ) -> Iterator[Frame]:
         """The frames of all episodes; an observation after the last action is left out."""
         for episode, group in groups.items():
+            if episode in skip:
+                yield unread_episode(episode)
+                continue
             arrays = hdf5_arrays(self.path, group)
             T = len(arrays["actions"]) if "actions" in arrays else 0
+            advice = f"leave it out by --skip {episode}"
+            if T == 0:
+                refuse(self.path, f"episode {episode} has no actions: {advice}")
             for name in self.read - {None}:
                 if name not in arrays or len(arrays[name]) not in (T, T + 1):
                     refuse(
-                        self.path, f"episode {episode} has {T} actions, but not as many of {name}"
+                        self.path,
+                        f"episode {episode} has {T} actions, but not as many of {name}: {advice}",
                     )
             try:
                 action = arrays["actions"][:].reshape(T, -1)
@@ -1130,7 +1167,7 @@ def read_rlbench(path: Path, options: Options) -> Source:
     folders = {entry.name for entry in episodes[0].folder.iterdir() if entry.is_dir()}
     unread = folders - {f"{name}_depth" for name in cameras}
     return Source(
-        frames=rlbench_frames(episodes, cameras, workspace, options.instruction),
+        frames=rlbench_frames(episodes, cameras, workspace, options),
         total_episodes=len(episodes),
         unread=tuple(sorted(unread)),
         left_out=("the last frame of each episode, after which nothing is done",),
@@ -1142,24 +1179,31 @@ def rlbench_frames(
     episodes: list[rlbench_data.EpisodeFolder],
     cameras: list[str],
     workspace: list[list[float]],
-    instruction: str | None,
+    options: Options,
 ) -> Iterator[Frame]:
-    """The frames of all episodes but the last of each; `instruction` is the one of --instruction.
+    """The frames of all episodes but the last of each.
 
     The action of a frame is what leads to the next one.
     """
     tasks: dict[str, int] = {}  # name -> its number
     for number, episode in enumerate(episodes):
+        if number in options.skip:
+            yield unread_episode(number)
+            continue
         moments = rlbench_data.read_moments(episode)
         if len(moments) < 2:
-            refuse(episode.folder, "has a single frame, so that nothing is done in it")
+            refuse(
+                episode.folder,
+                "has a single frame, so that nothing is done in it: leave it out by "
+                f"--skip {number}",
+            )
         files = {
             camera: rlbench_data.depth_files(episode, camera, len(moments)) for camera in cameras
         }
         variation = rlbench_data.read_variation(episode, moments)
         name = rlbench_data.task_name(episode.task, variation)
         task = tasks.setdefault(name, len(tasks))
-        described = None if instruction else rlbench_data.read_instruction(episode)
+        described = None if options.instruction else rlbench_data.read_instruction(episode)
         for i, (moment, following) in enumerate(pairwise(moments)):
             yield Frame(
                 episode=number,
@@ -1483,12 +1527,16 @@ def read_options(args: argparse.Namespace) -> Options:
 def import_recordings(args: argparse.Namespace) -> None:
     """Writes a file for each task that was found, and says what was left out of it."""
     path = Path(args.import_)
+    out = Path(args.out or "recordings")
     if args.num_points < 1:
         raise UserError(f"--num-points is {args.num_points}: use at least 1")
+    if out.suffix == ".npz" or any(folder.is_file() for folder in (out, *out.parents)):
+        raise UserError(f"--out is {out}: name a folder, in which each task will have a file")
+    if args.task is not None and not re.fullmatch(NAME, args.task):
+        raise UserError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
     if not path.exists():
         refuse(path, "is missing: look at --import")
     options = read_options(args)
-    out = Path(args.out or "recordings")
     if args.task and (out / f"{args.task}.npz").exists():  # before all is read
         refuse(out / f"{args.task}.npz", "already exists: move it, or use another --task or --out")
     read = reader_of(path)
@@ -1611,6 +1659,8 @@ def show(path: str, out: str | None, episode: int) -> None:
     picture = Path(out) if out else Path(path).with_suffix(".png")
     if picture.suffix != ".png":
         raise UserError(f"--out is {out}: name a .png file")
+    if out and not picture.parent.is_dir():
+        raise UserError(f"--out is {out}: its folder does not exist")
     recording = load_demonstrations(path)
     if not 0 <= episode < len(recording):
         refuse(path, f"holds episodes 0 to {len(recording) - 1}, not {episode}")

@@ -39,7 +39,7 @@ import numpy as np
 import PIL.Image
 
 from data import RecordingError
-from robot import compose, depth_to_points, difference, nearer, quaternion, thin
+from robot import compose, depth_to_points, difference, nearer, quaternion, thin, transform
 
 CAMERAS = ("front", "left_shoulder", "right_shoulder")
 WRIST = "wrist"  # one camera more, where it is asked for
@@ -110,7 +110,7 @@ class View:
         """The point of each pixel, (H W, 3) float32, world frame."""
         metres = self.near + self.depth.astype(np.float64) * (self.far - self.near)
         points = depth_to_points(metres, self.intrinsics)  # camera frame
-        return (points @ self.pose[:3, :3].T + self.pose[:3, 3]).astype(np.float32)
+        return transform(points, self.pose)
 
 
 def read_view(where: Path | str, misc: Mapping[str, Any], camera: str, depth: np.ndarray) -> View:

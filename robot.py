@@ -256,7 +256,7 @@ def check_value(
 def load_settings(path: str | Path) -> Settings:
     """Reads --config. UserError, one line: missing, unknown, of the wrong type, out of range."""
     try:
-        return Settings(**json.loads(Path(path).read_text()))
+        return Settings(**json.loads(Path(path).read_text(encoding="utf-8")))
     except OSError as error:
         reason = f"{path} cannot be read ({error.strerror})"
         raise UserError(f"{reason}: name it by --config, or copy assets/robot.json") from None
@@ -351,6 +351,11 @@ class RTDE:
 
     A thread keeps the newest state. A lost connection stays lost: make a new client. Only a program
     that was made for this `session` follows what `send` writes.
+
+    Args:
+        hz: how many states a second the controller sends.
+        write: claims the input registers; without it `send` must not be called.
+
     Raises RobotError: refused version, a field NOT_FOUND or IN_USE, lost connection or framing.
     """
 
@@ -507,7 +512,8 @@ class RTDE:
             self.number += 1
             if self.rotation is None:
                 self.rotation = pose[3:]
-            self.rotation = nearer(pose[3:], self.rotation)  # no jump by 2 pi between two packages
+            # rarely a jump by 2 pi between two packages
+            self.rotation = nearer(pose[3:], self.rotation)
             command = STOP if stop else self.session
             inputs = (self.number, *pose[:3], *self.rotation, command, self.number)
             self.transmit(DATA, self.input_recipe + np.array(inputs, self.input_format).tobytes())
@@ -661,7 +667,11 @@ class Bridge:
 
 
 class Gripper:
-    """An AG95: frames of Modbus RTU over a serial port, 115200 8N1, or a serial bridge on TCP."""
+    """An AG95: frames of Modbus RTU over a serial port, 115200 8N1, or a serial bridge on TCP.
+
+    Raises UserError without pyserial, where a serial port is named, and RobotError if the gripper
+    cannot be reached, or after ATTEMPTS faults of one exchange: within about 2 s.
+    """
 
     ATTEMPTS = 3  # each may end in a time-out, a bad check sum or an exception; then RobotError
 
@@ -674,7 +684,12 @@ class Gripper:
             if settings.gripper_serial:
                 import serial
 
-                self.port = serial.Serial(settings.gripper_serial, 115200, timeout=timeout)
+                self.port = serial.Serial(
+                    settings.gripper_serial,
+                    115200,
+                    timeout=timeout,
+                    exclusive=True,  # another command would take our answers for its own
+                )
             else:
                 self.port = Bridge(host, settings.gripper_port, timeout)
         except ImportError:
@@ -729,7 +744,10 @@ class Gripper:
         self.exchange(WRITE, FORCE, self.settings.gripper_force_percent)
 
     def move(self, closed: float) -> None:
-        """Goes to 0 (open) ... 1 (closed); nothing is sent for a change below 1 %."""
+        """Goes to 0 (open) ... 1 (closed); nothing is sent for a change below 1 %.
+
+        It returns at once, and does not wait until the gripper is there.
+        """
         open_at = self.settings.gripper_open_at
         closed_at = 1000 - open_at
         share = min(1.0, max(0.0, closed))
@@ -769,13 +787,19 @@ def depth_to_points(depth: np.ndarray, intrinsics: Sequence[float]) -> np.ndarra
     return np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=-1).astype(np.float32)
 
 
+def transform(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Moves the positions of points (M, P) by a pose (4, 4); returns float32."""
+    moved = points.astype(np.float32)  # a copy
+    moved[:, :3] = points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    return moved
+
+
 def to_base(depth: np.ndarray, intrinsics: Sequence[float], settings: Settings) -> np.ndarray:
     """Depth (H, W), metres -> points (M, 3) float32, base frame. Raises CameraError for none."""
     points = depth_to_points(depth, intrinsics)
     if len(points) == 0:
         raise CameraError("the camera's depth is empty: check its cable, power and what it sees")
-    pose = np.array(settings.camera_to_base)
-    return (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
+    return transform(points, np.array(settings.camera_to_base))
 
 
 def crop(points: np.ndarray, settings: Settings) -> np.ndarray:
@@ -801,14 +825,18 @@ def cloud(
 
     The points in the crop box are farthest point sampled. Fewer than N are repeated, and more than
     SAMPLED_FROM are thinned before: sampling holds Python's lock, so that no other thread runs, and
-    300 000 points would delay the servo stream by a quarter of a second.
+    300 000 points would delay the servo stream by a quarter of a second. Raises CameraError for an
+    image without depth, and if no point lies in the crop box.
     """
     points = crop(to_base(depth, intrinsics, settings), settings)
     return data.farthest_point_sample(thin(points), settings.num_points), len(points)
 
 
 class RealSense:
-    """The depth stream of the first RealSense camera found, with that stream's own intrinsics."""
+    """The depth stream of the first RealSense camera found, with that stream's own intrinsics.
+
+    Raises UserError without pyrealsense2, CameraError if the camera does not start.
+    """
 
     def __init__(self, width: int = 640, height: int = 480, hz: int = 30) -> None:
         try:
@@ -847,7 +875,10 @@ def realsense_intrinsics(stream: Any) -> tuple[float, ...]:
 
 
 class RecordedCamera:
-    """Replays an `.npz` of depth (F, H, W) uint16, millimetres, and intrinsics (4,) for ever."""
+    """Replays an `.npz` of depth (F, H, W) uint16, millimetres, and intrinsics (4,) for ever.
+
+    Raises UserError for any other file.
+    """
 
     def __init__(self, path: str | Path) -> None:
         try:
@@ -956,10 +987,17 @@ def nearer(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Of the two vectors (3,) of one rotation, angles a and a - 2 pi, the nearer to `reference`.
 
     For a tool that points down, half a turn from the base, the controller's jumps between them.
+    Where both are as far from `reference`, the result jumps, too.
     """
     angle = np.linalg.norm(rotvec)
     other = rotvec * (1 - 2 * np.pi / angle) if angle > 0 else rotvec
     return min(rotvec, other, key=lambda v: np.linalg.norm(v - reference))
+
+
+def write_rotation(rotvec: np.ndarray) -> str:
+    """What to do where `nearer` jumps: names the shorter of the tool's two rotation vectors."""
+    shorter = nearer(rotvec, np.zeros(3)).round(3) + 0.0  # no -0.0
+    return f"write the tool's own to rotation_near_rad of --config, {shorter.tolist()}"
 
 
 def lengths(steps: np.ndarray) -> np.ndarray:
@@ -1044,9 +1082,8 @@ class Servo:
         self.error: str | None = None  # why the arm was stopped
         self.ended = threading.Event()
         self.counters: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
-        self.least_delay = (
-            math.inf
-        )  # of all states; delays have a constant added, which does not matter
+        # The least delay of all states. To all delays a constant is added, which does not matter.
+        self.least_delay = math.inf
         self.last_step = (time.monotonic(), time.process_time())  # of the stream
         self.stall = ""  # why the stream stood still for so long that the watchdog may have struck
         self.stalled_at = -math.inf  # when that was noticed
@@ -1492,8 +1529,8 @@ def to_recording(
 ) -> Demonstrations:
     """An episode of frames (T) and actions (T, 7), behind those of an earlier recording.
 
-    The times of the frames, in seconds, and how many points they were sampled from are added to
-    `meta`.
+    Points are stored as float16, states and actions as float32. The times of the frames, in
+    seconds, and how many points they were sampled from are added to `meta`.
     """
     times = [round(frame.time - frames[0].time, 4) for frame in frames]
     points_seen = [frame.seen for frame in frames]
@@ -1519,6 +1556,16 @@ def to_recording(
     )
 
 
+def make_folder(out: Path) -> None:
+    """Makes the folder of a file; UserError if it cannot be made, or not be written to."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror}") from None
+    if not os.access(out.parent, os.W_OK):
+        raise UserError(f"{out} cannot be written: no permission to write to its folder")
+
+
 def save(out: Path, recording: Demonstrations) -> Demonstrations:
     """Writes a recording and returns it; UserError names the path where the disk is full."""
     try:
@@ -1534,7 +1581,10 @@ def save(out: Path, recording: Demonstrations) -> Demonstrations:
 def run(args: argparse.Namespace, settings: Settings) -> None:
     """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and so on."""
     common.pick_device(args.device)
-    policy, info = model.load(args.checkpoint, args.device, needs=("text_weights",))
+    checkpoint = Path(args.checkpoint)
+    if checkpoint.is_dir():
+        checkpoint = checkpoint / "adapted.pt"
+    policy, info = model.load(checkpoint, args.device, needs=("text_weights",))
     config = policy.config
     if (config.state_dim, config.action_dim) != (STATE_DIM, ACTION_DIM):
         raise UserError(
@@ -1685,6 +1735,7 @@ def drive(
     out = Path(args.out or f"runs/robot/{name}")
     if out.exists():
         raise UserError(f"{out} exists: move it, or give another --out")
+    make_folder(out)
     log = Log()
     with connect(args, settings, write=not args.dry_run) as cell:
         meta = {**cell.made_with(recording), "made_by": f"robot.{args.command}"}
@@ -1789,6 +1840,9 @@ def episode_actions(frames: list[Frame], grip: list[float], settings: Settings) 
     """
     poses = [frame.state[:6].astype(float) for frame in frames]
     settings.check_poses(poses)
+    rotvecs = np.array(poses)[:, 3:]  # (T, 3)
+    if (np.linalg.norm(np.diff(rotvecs, axis=0), axis=1) > np.pi).any():
+        raise RobotError(f"the rotation vector flips: {write_rotation(rotvecs[0])}")
     times = [frame.time for frame in frames]
     gaps = np.diff(times) if len(times) > 1 else np.zeros(1)  # seconds
     # An action takes 1 / policy_hz seconds: `replay` would be faster than the hand was.
@@ -1872,6 +1926,8 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
     The keys are those of the terminal. Where standard input is no terminal, they are read from it,
     as a script or a foot pedal writes them, and its end means q.
     """
+    if not TERMINAL_ERRORS:
+        raise UserError("record reads keys as POSIX systems do: use Linux or macOS")
     if not re.fullmatch(data.NAME, args.task):
         raise UserError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
     out = Path(args.out or f"demos/{args.task}.npz")
@@ -1900,7 +1956,8 @@ def record_episodes(
         cell.prepare(servo)
         recorder = Recorder(args=args, cell=cell, out=out, meta=meta, kept=kept)
         closed = cell.gripper.read()
-        if moves and 0.1 < closed < 0.9:  # it may hold something: closed is what it is told
+        if moves and 0.1 < closed < 0.9:
+            # between open and closed: it may hold something, so it is told to close
             cell.gripper.move(1.0)
             closed = 1.0
         recorder.closed = float(closed > 0.5)
@@ -1951,6 +2008,7 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
         try:
             state.check()
             settings.check_poses([state.pose])
+            check_reference(state.pose, settings)
             if answers["is in remote control"] == "false":
                 raise RobotError("it is not in remote control: switch that at the panel")
         except RobotError as error:
@@ -1992,6 +2050,17 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
         raise RobotError(f"not ready: {trouble}")
 
 
+def check_reference(pose: np.ndarray, settings: Settings) -> None:
+    """Raises RobotError if the rotation vector of a pose (6,) may flip while the arm works.
+
+    Both vectors of a tool that points down are 4.4 from rotation_near_rad if that points down, too,
+    but is yawed by half a turn: then each tremor makes the other one the nearer.
+    """
+    reference = np.array(settings.rotation_near_rad)
+    if np.linalg.norm(nearer(pose[3:], reference) - reference) > 3.6:
+        raise RobotError(f"the rotation vector may flip: {write_rotation(pose[3:])}")
+
+
 def plot_cell(path: str, frame: Frame, meta: dict) -> None:
     """Draws a frame's points and TCP, and the boxes that `meta` names."""
     recording = to_recording(
@@ -2007,8 +2076,8 @@ def plot_cell(path: str, frame: Frame, meta: dict) -> None:
 def record_camera(args: argparse.Namespace) -> None:
     """Records depth images to a file that --camera replays."""
     out = Path(args.out)
-    if out.suffix != ".npz" or not out.parent.is_dir():
-        raise UserError(f"--out is {out}: name an .npz file in a folder that exists")
+    if not out.parent.is_dir():
+        raise UserError(f"--out is {out}: its folder does not exist")
     if args.frames < 1:
         raise UserError(f"--frames is {args.frames}: use at least 1")
     camera = RecordedCamera(args.camera) if args.camera else RealSense()
@@ -2067,7 +2136,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     flag("--episode", type=int, default=0, help="which, from 0 (default: 0)")
 
     flag = add["run"]
-    flag("--checkpoint", required=True, help="adapted policy of finetune.py")
+    flag("--checkpoint", required=True, help="adapted policy of finetune.py, or its folder")
     flag("--seconds", type=float, default=60, help="how long (default: 60)")
     flag("--seed", type=int, default=0, help="of noise and reference demonstration (default: 0)")
     flag("--device", default="cpu", help="where the policy computes: cpu, cuda (default: cpu)")
@@ -2081,6 +2150,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
+    if getattr(args, "out", None) is not None and Path(args.out).suffix != ".npz":
+        raise UserError(f"--out is {args.out}: name an .npz file")
     if args.command == "camera":
         record_camera(args)
     else:

@@ -285,9 +285,11 @@ class Emulator:
             text += part
         time.sleep(START_SECONDS / 2)
         if select.select([connection], [], [], START_SECONDS / 2)[0]:
-            connection.recv(65536)  # of a client that closed without reading this raises an error,
+            # The client has closed. If it had read nothing, recv raises an error, or the socket
+            # keeps one.
+            connection.recv(65536)
             if connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-                return  # or leaves one
+                return
         self.load(text.decode())
         time.sleep(self.faults.mute)
         with contextlib.suppress(OSError):
@@ -365,14 +367,14 @@ class Emulator:
     # ---- RTDE
 
     def value(self, name: str):
-        faults, angle = self.faults, self.pose
+        faults = self.faults
         if name in self.outputs:
             return self.outputs[name]
         clock = time.monotonic() - self.clock
         return {
             "timestamp": 1.0 if faults.frozen else 1e6 - clock if faults.backward else clock,
-            "target_q": tuple(angle),
-            "actual_q": tuple(angle),  # no kinematics here
+            "target_q": tuple(self.pose),  # no kinematics here
+            "actual_q": tuple(self.pose),
             "actual_TCP_pose": tuple(self.pose),
             "actual_TCP_speed": tuple(self.speed),
             "robot_mode": faults.robot_mode,
@@ -567,9 +569,8 @@ def write_scene(path, frames: int = 20) -> None:
     rows, columns = np.mgrid[:height, :width]
     depth = np.empty((frames, height, width), np.uint16)
     for frame in range(frames):
-        x = (
-            CAMERA[0] + (columns - width / 2) / focal * 0.85
-        )  # where a ray meets the plane of the cube's top
+        # Where a ray meets the plane of the cube's top
+        x = CAMERA[0] + (columns - width / 2) / focal * 0.85
         y = CAMERA[1] - (rows - height / 2) / focal * 0.85
         center = CAMERA[0] + 0.05 * math.sin(2 * math.pi * frame / frames)
         on_top = (abs(x - center) < 0.025) & (abs(y - CAMERA[1]) < 0.025)

@@ -17,6 +17,7 @@ import PIL.Image
 import pyarrow
 import pyarrow.parquet
 import pytest
+import rlbench_standin as standin
 import zarr
 from conftest import fails
 
@@ -45,6 +46,8 @@ def test_show_draws_a_picture_of_an_episode_that_there_is(capsys):
     assert "reach.npz: holds episodes 0 to 1, not 2" in message
     message = fails(convert, ["--show", "reach.npz", "--out", "reach.v2"], capsys)
     assert "--out is reach.v2: name a .png file" in message
+    message = fails(convert, ["--show", "nothing.npz", "--out", "nowhere/reach.png"], capsys)
+    assert "--out is nowhere/reach.png: its folder does not exist" in message
 
 
 def test_the_script_itself_ends_in_one_line_where_a_file_is_missing():
@@ -134,6 +137,24 @@ def test_a_replay_buffer_becomes_a_recording(zarr_format, zipped, capsys):
     assert "already exists" in fails(convert, ["--import", path, *SAY, *argv], capsys)
 
 
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ("--task ../evil", "--task '../evil': use letters, digits"),
+        ("--task stir --out stir.npz", "--out is stir.npz: name a folder, in which each task"),
+        ("--out file", "--out is file: name a folder, in which each task"),
+        ("--out file/recordings", "--out is file/recordings: name a folder"),
+    ],
+)
+def test_names_that_nothing_could_be_written_to_are_refused_before_anything_is_read(
+    options, message, capsys, monkeypatch
+):
+    buffer("stir.zarr")
+    Path("file").touch()
+    monkeypatch.setattr(convert, "reader_of", None)
+    assert message in fails(convert, ["--import", "stir.zarr", *SAY, *options.split()], capsys)
+
+
 EMPTY = np.full((20, 30, 3), np.nan)
 FAR = 90 + RNG.uniform(0, 0.1, (20, 30, 3))
 
@@ -163,7 +184,6 @@ FAR = 90 + RNG.uniform(0, 0.1, (20, 30, 3))
         ({"data__action": np.zeros((19, 4))}, SAY, "lengths differ"),
         ({"meta__episode_ends": np.array([8, 21])}, SAY, "lengths differ"),
         ({"meta__episode_ends": np.array([8.0, 20.0])}, SAY, "growing whole numbers"),
-        ({}, [*SAY, "--task", "../evil"], "is no name"),
         ({}, [*SAY, "--positions-in-state", "3"], "positions_in_state is 3"),
         ({}, [*SAY, "--num-points", "0"], "--num-points is 0: use at least 1"),
     ],
@@ -637,6 +657,22 @@ def test_instructions_that_differ_in_a_dot_become_two_files(capsys):
     assert "already exists: move it, or use another --out" in message
 
 
+def test_files_are_read_as_utf_8_whatever_the_systems_own_encoding_is(monkeypatch):
+    dataset("kitchen", "v2.1")
+    tasks = [{"task_index": 0, "task": "Öffne die Tür."}, {"task_index": 1, "task": "Gieße Tee."}]
+    lines = "\n".join(json.dumps(task, ensure_ascii=False) for task in tasks)
+    Path("kitchen/meta/tasks.jsonl").write_text(lines, encoding="utf-8")
+    edit(note=lambda _: "für Tee")
+    information = Path("kitchen/meta/info.json")
+    text = json.dumps(json.loads(information.read_text()), ensure_ascii=False)
+    information.write_text(text, encoding="utf-8")
+    read = Path.read_text
+    monkeypatch.setattr(Path, "read_text", lambda path, encoding="ascii": read(path, encoding))
+    convert.main(["--import", "kitchen"])
+    found = load_demonstrations("recordings/öffne-die-tür.npz")
+    assert found.instruction == "Öffne die Tür."
+
+
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_no_tasks_are_needed_where_the_instruction_is_given(version):
     dataset("kitchen", version, task_index=np.zeros(20, int))
@@ -697,6 +733,14 @@ def test_of_two_lenses_none_is_guessed_and_the_file_of_the_camera_comes_first(ca
     convert.main("--import kitchen --num-points 192 --camera camera.json".split())
     found = load_demonstrations("recordings/pour-the-tea.npz").points
     assert found[..., 0].max() == pytest.approx((15 - 8) / 80 * 2, abs=1e-3)
+
+
+def test_intrinsics_of_another_resolution_in_the_file_of_the_camera_are_warned_of():
+    dataset("kitchen", seen=DEPTH, info=MILLIMETRES, **{DEPTH: one_pixel(2000)})
+    Path("camera.json").write_text(json.dumps({"intrinsics": [80.0, 100.0, 16.0, 12.0]}))
+    message = "principal point, 16, 12, is far from the middle of the depth, 16 x 12: are the intr"
+    with pytest.warns(UserWarning, match=message):
+        convert.main("--import kitchen --camera camera.json".split())
 
 
 @pytest.mark.parametrize(
@@ -1118,6 +1162,31 @@ def test_points_that_maniskill_did_not_see_are_left_out(capsys):
     assert (found[..., 3:] == 1).all()
 
 
+@pytest.mark.parametrize("actions", [0, 5])
+@pytest.mark.parametrize("number, T", [(9, 8), (10, 12)])
+def test_a_damaged_demonstration_is_left_out_as_the_error_advises(number, T, actions, capsys):
+    values = robomimic("demo.hdf5")
+    with h5py.File("demo.hdf5", "a") as file:
+        del file[f"data/demo_{number}/actions"]
+        file[f"data/demo_{number}/actions"] = np.zeros((actions, 7))
+    message = fails(convert, ["--import", "demo.hdf5", *SAY], capsys)
+    assert f"episode {number} has {actions or 'no'} actions" in message
+    convert.main(["--import", "demo.hdf5", *SAY, *message.split(" by ")[1].split()])
+    assert f"episode {number} (--skip)" in capsys.readouterr().out
+    found = load_demonstrations("recordings/stir-the-soup.npz")
+    other = values[f"demo_{19 - number}"]["actions"]
+    np.testing.assert_allclose(found.action, other, rtol=1e-6)
+
+
+def test_an_array_of_which_a_demonstration_has_none_is_named_unless_that_is_left_out(capsys):
+    robomimic("demo.hdf5")
+    change_hdf5(lambda file: file.pop("data/demo_9/obs/robot0_eef_pos"))()
+    message = fails(convert, ["--import", "demo.hdf5", *SAY], capsys)
+    assert "name the arrays of the state with --state" in message  # the first one decides
+    convert.main(["--import", "demo.hdf5", *SAY, "--skip", "9"])
+    assert load_demonstrations("recordings/stir-the-soup.npz").episode_ends.tolist() == [12]
+
+
 def change_hdf5(change):
     def damage():
         with h5py.File("demo.hdf5", "a") as file:
@@ -1132,7 +1201,8 @@ def change_hdf5(change):
         (lambda: None, [], "it does not say what is done: add --instruction"),
         (change_hdf5(lambda f: f.pop("data/demo_9")), SAY, "should have 20 frames, but has 12"),
         (change_hdf5(lambda f: f.pop("data/demo_9/actions")), SAY, "it lacks actions"),
-        (change_hdf5(lambda f: f.pop("data/demo_10/actions")), SAY, "episode 10 has 0 actions"),
+        (change_hdf5(lambda f: f.pop("data/demo_10/actions")), SAY, "episode 10 has no actions"),
+        (lambda: None, [*SAY, "--skip", "9", "10"], "--skip leaves no episode"),
         (
             change_hdf5(lambda f: f["data/demo_9"].attrs.modify("num_samples", 9)),
             SAY,
@@ -1151,3 +1221,18 @@ def test_wrong_hdf5_is_refused_in_one_line(damage, options, message, capsys, mon
     damage()
     assert message in fails(convert, ["--import", "demo.hdf5", *options], capsys)
     assert not Path("recordings").exists()
+
+
+# ---- RLBench; more of it is in test_rlbench.py ---------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_damaged_episode_of_rlbench_can_be_left_out(number, capsys, monkeypatch):
+    standin.install(monkeypatch)
+    variation = standin.write_task("rlbench/close_box", episodes=2)  # 4 and 5 frames
+    os.truncate(variation / "episodes" / f"episode{number}" / "low_dim_obs.pkl", 3000)
+    assert "is damaged or no pickle" in fails(convert, ["--import", "rlbench"], capsys)
+    convert.main(["--import", "rlbench", "--skip", str(number)])
+    assert f"episode {number} (--skip)" in capsys.readouterr().out
+    found = load_demonstrations("recordings/close_box.npz")
+    assert found.episode_ends.tolist() == [4 - number]

@@ -1,6 +1,7 @@
 """Every command in README.md exists and takes the options given, and every name is there."""
 
 import importlib
+import json
 import re
 import shlex
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import convert
 import data
 import model
 
@@ -54,18 +56,23 @@ def test_a_policy_is_used_from_python_as_the_readme_says(tmp_path, monkeypatch):
         episode_ends=np.array([30]),
         meta={},
     )
-    data.save_demonstrations("recordings/stir.npz", recording)
+    data.save_demonstrations("new/stir.npz", recording)
     Path("runs/finetune/stir-seed0").mkdir(parents=True)
     policy = model.build_policy(model.PRESETS["tiny"])
     info = {"suite": "own", "preset": "tiny", "arguments": {}, "step": 1}
     info["text_weights"] = "random-seed-0"
     model.save("runs/finetune/stir-seed0/adapted.pt", policy, **info)
     observed = {
-        "last_two_clouds": rng.normal(size=(2, 300, 3)).astype(np.float32),
-        "last_two_states": rng.normal(size=(2, 9)).astype(np.float32),
+        "last_two_clouds": rng.normal(size=(2, 300, 3)),  # float64
+        "last_two_states": rng.normal(size=(2, 9)),
     }
     exec(script, observed)
     assert observed["actions"].shape == (8, 4)
+
+
+def test_the_cameras_file_in_the_readme_can_be_read():
+    [block] = re.findall(r"^```json\n(.*?)^```", README, re.M | re.S)
+    assert convert.Camera(**json.loads(block)).crop_low_m == [0.1, -0.4, -0.02]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -429,6 +429,31 @@ def test_of_the_two_vectors_of_a_rotation_the_nearer_is_taken():
     assert robot.nearer(np.zeros(3), down).tolist() == [0, 0, 0]
 
 
+def frames_of_a_yawed_tool(settings, wobble=0.01):
+    """Frames of a tool that points down, yawed by half a turn from the reference: 20 a second."""
+    rng, reference = np.random.default_rng(0), np.array(settings.rotation_near_rad)
+    frames = []
+    for i in range(200):
+        turn = Rotation.from_rotvec(rng.normal(scale=wobble, size=3))
+        rotvec = (turn * Rotation.from_rotvec([np.pi, 0.0, 0.0])).as_rotvec()
+        state = np.array([*START_POSE[:3], *robot.nearer(rotvec, reference), 0.0], np.float32)
+        frames.append(robot.Frame(time=i / 20, points=None, seen=0, state=state))
+    return frames
+
+
+def test_a_recorded_rotation_vector_does_not_flip_unseen(settings):
+    settings = replace(settings, policy_hz=20)
+    frames = frames_of_a_yawed_tool(settings)
+    with pytest.raises(RobotError, match=r"vector flips: write .* to rotation_near_rad") as flips:
+        robot.episode_actions(frames, [0.0] * 200, settings)
+    advised = json.loads(str(flips.value).split(", ", 1)[1])
+    settings = replace(settings, rotation_near_rad=advised)
+    frames = frames_of_a_yawed_tool(settings)
+    assert len(robot.episode_actions(frames, [0.0] * 200, settings)) == 200
+    states = np.array([frame.state for frame in frames])
+    assert np.linalg.norm(np.diff(states[:, 3:6], axis=0), axis=1).max() < 0.2
+
+
 def test_a_chunk_moves_the_arm_to_where_its_actions_add_up(emulator, settings):
     with Moving(settings) as servo:
         servo.follow(steps(dx=0.01, drz=0.01))
@@ -878,6 +903,25 @@ def test_an_adapter_that_is_pulled_out_is_a_gripper_that_fails(emulator, setting
     gripper.close()
 
 
+def test_a_serial_port_of_the_gripper_belongs_to_one_command(settings, monkeypatch):
+    held = set()
+
+    def serial(port, baud, timeout, exclusive=False):
+        """As pyserial does it on POSIX systems."""
+        if exclusive and port in held:
+            raise OSError(f"Could not exclusively lock port {port}")
+        held.add(port)
+        return SimpleNamespace(close=lambda: held.remove(port))
+
+    monkeypatch.setitem(sys.modules, "serial", SimpleNamespace(Serial=serial))
+    settings = replace(settings, gripper_serial="/dev/ttyUSB0")
+    first = Gripper(settings, "127.0.0.1")
+    with pytest.raises(RobotError, match=r"/dev/ttyUSB0 cannot be reached: .*exclusively"):
+        Gripper(settings, "127.0.0.1")
+    first.close()
+    Gripper(settings, "127.0.0.1").close()
+
+
 def test_a_late_answer_is_not_taken_for_the_next_one(emulator, settings):
     gripper = Gripper(settings, "127.0.0.1", timeout=0.1)
     gripper.initialize()
@@ -1133,8 +1177,25 @@ def test_a_file_that_is_missing_or_holds_no_settings_is_refused_in_one_line(tmp_
         robot.load_settings(path)
 
 
-def test_the_example_settings_are_valid():
-    assert robot.load_settings(ROOT / "assets" / "robot.json").servo_hz == 125
+def test_settings_are_read_as_utf_8_whatever_the_systems_own_encoding_is(tmp_path, monkeypatch):
+    path = tmp_path / "robot.json"
+    text = json.dumps(BOXES | {"gripper_serial": "/dev/Übergang"}, ensure_ascii=False)
+    path.write_text(text, encoding="utf-8")
+    read = Path.read_text
+    monkeypatch.setattr(Path, "read_text", lambda path, encoding="ascii": read(path, encoding))
+    assert robot.load_settings(path).gripper_serial == "/dev/Übergang"
+
+
+def test_the_example_settings_keep_the_readmes_advice_about_reach():
+    path = ROOT / "assets" / "robot.json"
+    settings = robot.load_settings(path)
+    assert settings.servo_hz == 125 and "rotation_near_rad" in json.loads(path.read_text())
+    low, high = np.array(settings.tcp_low_m), np.array(settings.tcp_high_m)
+    nearest = np.zeros(2).clip(low[:2], high[:2])  # to the base's axis
+    farthest = np.maximum(abs(low), abs(high))
+    assert np.linalg.norm(nearest) > 0.3 and np.linalg.norm(farthest) < 1.0
+    for x, z in ((0, 0.3), (-0.05, 0.25), (0.05, 0.25), (0, 0.2)):  # where the emulated hand goes
+        settings.check_poses([np.array([START_POSE[0] + x, START_POSE[1], z, *START_POSE[3:]])])
 
 
 # ---- Commands ------------------------------------------------------------------------------------
@@ -1247,6 +1308,11 @@ def test_check_reports_everything_and_moves_nothing(emulator, cell, capsys):
         emulator.faults = type(emulator.faults)(**faults)
         assert ends(["check", *cell]) == 2
         assert message in capsys.readouterr().err
+    emulator.faults = type(emulator.faults)()
+    emulator.pose[3:] = [3.1, 0.0, 0.0]
+    assert ends(["check", *cell]) == 2
+    advice = "the rotation vector may flip: write the tool's own to rotation_near_rad of --config, "
+    assert f"{advice}[3.1, 0.0, 0.0]" in capsys.readouterr().err
     assert emulator.received == [] and emulator.programs == []
     assert all(frame[1] == 3 for frame in emulator.gripper_frames)  # reads only
 
@@ -1433,6 +1499,23 @@ def test_what_cannot_be_recorded_is_refused_before_connecting(cell, capsys, monk
         assert ends(record(cell, 1)) == 2
     assert "another process runs in demos" in capsys.readouterr().err
     assert ends(record(cell, 1)) == 2 and "cannot be reached" in capsys.readouterr().err
+    monkeypatch.setattr(robot, "TERMINAL_ERRORS", ())  # as on Windows
+    assert ends(record(cell, 1)) == 2 and "use Linux or macOS" in capsys.readouterr().err
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_connecting(
+    running, capsys, monkeypatch, tmp_path
+):
+    Path("robot.json").write_text(json.dumps(BOXES | {"rtde_port": 1, "gripper_port": 1}))
+    replay = ["replay", *running[1:-4], "--data", "demos.npz"]
+    for argv in (record(running[1:-4], 1), running, replay):
+        assert ends([*argv, "--out", "log"]) == 2
+        assert "--out is log: name an .npz file" in capsys.readouterr().err
+    assert ends([*replay, "--out", "robot.json/log.npz"]) == 2
+    assert "robot.json/log.npz cannot be written: File exists" in capsys.readouterr().err
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    assert ends([*replay, "--out", "new/log.npz"]) == 2
+    assert "new/log.npz cannot be written: no permission" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_told_with_the_path(emulator, cell, monkeypatch, capsys):
@@ -1454,9 +1537,12 @@ def test_a_camera_is_recorded_to_a_file_that_is_replayed(cell, capsys):
     begin = first.read()
     for image in (begin, first.read(), first.read(), begin):  # the fourth is the first again
         np.testing.assert_array_equal(again.read(), image)
-    for out in ("again", "none/again.npz"):  # said before anything is recorded
+    for out, message in (
+        ("again", "name an .npz file"),
+        ("none/again.npz", "its folder does not exist"),
+    ):  # said before anything is recorded
         assert ends(["camera", "--camera", "scene.npz", "--out", out]) == 2
-        assert "name an .npz file in a folder that exists" in capsys.readouterr().err
+        assert f"--out is {out}: {message}" in capsys.readouterr().err
     assert ends(["camera", "--camera", "scene.npz", "--out", "a.npz", "--frames", "0"]) == 2
     assert "--frames is 0: use at least 1" in capsys.readouterr().err
 
@@ -1591,6 +1677,15 @@ def test_running_moves_the_arm_within_its_limits_and_ends_with_a_stop(
     assert len(log.state) == len(log.meta["commanded"]) == len(log.meta["points_seen"]) >= 16
     policy, _ = model.load("policy.pt")
     assert len(data.WindowSampler(log, policy.config)) > 0
+
+
+def test_a_folder_of_finetune_is_run_as_its_checkpoint_is(running, capsys):
+    os.mkdir("adapted")
+    argv = [*running, "--checkpoint", "adapted", "--seconds", "0"]
+    assert ends(argv) == 2
+    assert "no checkpoint at adapted/adapted.pt" in capsys.readouterr().err
+    os.rename("policy.pt", "adapted/adapted.pt")
+    assert ends(argv) == 0
 
 
 def test_a_policy_sees_the_last_two_frames_and_what_it_draws_is_followed(running, monkeypatch):
