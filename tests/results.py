@@ -276,7 +276,7 @@ def mean(results: Results, variant: str, column: Column) -> str:
         return ""
     if len(rates) == 1:
         return f"{pooled(results, variant, column)} (one run)"
-    each = ", ".join(f"{rate:.0f}" for rate in rates)
+    each = ", ".join(f"{rate:.1f}".removesuffix(".0") for rate in rates)
     return f"{np.mean(rates):.1f} ({each})"
 
 
@@ -526,8 +526,24 @@ SHOWN_ANOTHER = "demonstration of another task"  # as reports of `evaluate.py --
 HIDDEN_ROWS = (
     ("with the goal's own demonstration", "demonstration", Column("novel", 0)),
     ("the same, from 20 starts", "demonstration", Column("starts")),
+    (
+        "with the goal's own, trained for twice as many steps",
+        "demonstration-twice-as-long",
+        Column("novel", 0),
+    ),
+    ("these, from 20 starts", "demonstration-twice-as-long", Column("starts")),
     ("with another goal's", "demonstration", Column("novel", SHOWN_ANOTHER)),
+    (
+        "with another goal's, trained for twice as many steps",
+        "demonstration-twice-as-long",
+        Column("novel", SHOWN_ANOTHER),
+    ),
     ("with zeros in its place", "demonstration", Column("novel", "zeros")),
+    (
+        "with zeros in its place, trained for twice as many steps",
+        "demonstration-twice-as-long",
+        Column("novel", "zeros"),
+    ),
     ("with its last frame alone", "demonstration", Column("parts", "last-frame")),
     ("without its actions", "demonstration", Column("parts", "no-actions")),
     ("with its frames in another order", "demonstration", Column("parts", "shuffled")),
@@ -535,21 +551,6 @@ HIDDEN_ROWS = (
         "with the goal's own, trained at twice the learning rate",
         "demonstration-twice-the-rate",
         Column("novel", 0),
-    ),
-    (
-        "with the goal's own, trained for twice as many steps",
-        "demonstration-twice-as-long",
-        Column("novel", 0),
-    ),
-    (
-        "the same, trained for twice as many steps, from 20 starts",
-        "demonstration-twice-as-long",
-        Column("starts"),
-    ),
-    (
-        "with another goal's, trained for twice as many steps",
-        "demonstration-twice-as-long",
-        Column("novel", SHOWN_ANOTHER),
     ),
     ("second order: before any step", "inner", Column("0-steps")),
     ("second order: 1 inner step", "inner", Column("1-steps")),
@@ -605,10 +606,10 @@ def hidden_goals_table(results: Results, skill: str) -> str:
 HIDDEN_SUMMARY = {  # the most important of these rows -> their titles in README
     "with the goal's own demonstration": "a demonstration of the goal",
     "the same, from 20 starts": "the same, from 20 starts in place of five",
-    "with the goal's own, trained for twice as many steps": "the same, with twice as many steps",
-    "the same, trained for twice as many steps, from 20 starts": (
-        "the same, with twice as many steps, from 20 starts"
+    "with the goal's own, trained for twice as many steps": (
+        "a demonstration of the goal, twice as many steps of training"
     ),
+    "these, from 20 starts": "these, from 20 starts in place of five",
     "with another goal's": "a demonstration of another goal",
     "with zeros in its place": "zeros in its place",
     "second order: before any step": "no demonstration, second-order MAML: before any step",
@@ -732,7 +733,6 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "pairs": pairs_table,
     "turned actions": lambda results: turned_actions_table(results, "reach"),
     "means": lambda results: means_table(results, "ml10"),
-    "rl": rl_table,
     "base": lambda results: by_task_table(results, "base", "ml10"),
     "novel": lambda results: by_task_table(results, "novel", "ml10"),
     "old variants": variants_table,
@@ -786,8 +786,8 @@ def plot_swap(results: Results, path: Path) -> None:
         axes.set_title(title, fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
     legend = [
-        Patch(color=own_color, label="all that it sees is of its task"),
-        Patch(color=other_color, label="part of it is of another task"),
+        Patch(color=own_color, label="all that it sees is of its own task"),
+        Patch(color=other_color, label="an input is of another task; a long bar: it is ignored"),
     ]
     figure.legend(handles=legend, ncols=2, loc="outside upper center", frameon=False, fontsize=8)
     save_png(figure, path, dpi=120)
@@ -923,7 +923,8 @@ def plot_by_task(results: Results, path: Path) -> None:
         "base tasks, as trained": TASKS["ml10"]["base"],
         "novel tasks, after 200 gradient steps": TASKS["ml10"]["novel"],
     }
-    plot_success(columns, path, "Success on ML10", paper_columns("ml10", ["dami"]), parts)
+    title = "Success at any step on ML10"
+    plot_success(columns, path, title, paper_columns("ml10", ["dami"]), parts)
 
 
 # ---- Comparing, and shipping ---------------------------------------------------------------------
