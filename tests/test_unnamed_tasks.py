@@ -199,14 +199,15 @@ def test_where_there_are_no_novel_tasks_nobody_can_ask_for_them(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     simulator = simulator_of("pairs")
     args = evaluate.parse(["--split", "novel"])
+    trained = {"suite": "pairs", "arguments": {}}  # what a checkpoint says
     with pytest.raises(evaluate.UserError, match="pairs has no novel tasks"):
-        evaluate.choose_tasks(args, simulator, "pairs", adapted_to=None)
+        evaluate.choose_tasks(args, simulator, "pairs", trained)
     with pytest.raises(evaluate.UserError, match="pairs has no novel tasks"):
         finetune.choose_tasks(["novel"], simulator, "pairs")
     with pytest.raises(evaluate.UserError, match="pairs has no novel tasks"):
         train.main(["--suite", "pairs", "--preset", "tiny", "--evaluate-on", "novel"])
     args = evaluate.parse(["--split", "all"])
-    tasks = evaluate.choose_tasks(args, simulator, "pairs", adapted_to=None)
+    tasks = evaluate.choose_tasks(args, simulator, "pairs", trained)
     assert evaluate.group_tasks(tasks, simulator, "pairs") == {"mean": tasks}
 
 
