@@ -153,9 +153,9 @@ def command_line(main: Callable[[], None], errors: tuple[type[Exception], ...] =
     """Runs a script's `main` and turns what a user can cause into one line on stderr.
 
     UserError, the exception types in `errors` (those of damaged or foreign files), a full disk and
-    too little memory end in exit code 2; Ctrl-C, SIGTERM and a closed terminal in 130; a closed
-    pipe, such as `| head`, in 1 and without a word. Every other exception is a mistake in the code
-    and keeps its traceback; `python -X dev` shows all of them.
+    too little memory end in exit code 2; Ctrl-C, SIGTERM and a closed terminal in 130; on POSIX
+    systems a closed pipe, such as `| head`, in 1 and without a word. Every other exception is a
+    mistake in the code and keeps its traceback; `python -X dev` shows all of them.
     """
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     for number in SIGNALS:
@@ -170,9 +170,8 @@ def command_line(main: Callable[[], None], errors: tuple[type[Exception], ...] =
     except BrokenPipeError:
         if not nobody_reads_the_output():
             raise
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # for what is still unwritten
+        devnull = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(devnull, sys.stdout.fileno())  # for what is still unwritten
         sys.exit(1)
     except Exception as error:
         line, code = describe_user_error(error, errors), 2

@@ -1383,6 +1383,12 @@ def main(argv: list[str] | None = None) -> None:
         args.demonstrations = simulator.demonstrations
     tasks = choose_tasks(args, simulator, suite, info)
     check_together(list(chain(*runs)), tasks)
+    for checkpoint in chain(*runs):
+        if choose_tasks(args, simulator, suite, checkpoint.info) != tasks:
+            raise UserError(
+                f"{checkpoint.path} was trained on other base tasks: measure it alone, or name "
+                "--task or --split novel"
+            )
     if args.swap and len(tasks) < 2:
         raise UserError(
             "--swap takes from another of the tasks that are measured, and this is one alone: name "

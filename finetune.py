@@ -589,6 +589,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     with common.locked(out):
         if args.resume and (out / "adapted.pt").exists():
             raise UserError(f"{out} holds the policy of one task: choose another --out")
+        finished = all((folder / "config.json").exists() for folder in folders.values())
+        if args.resume and (out / "success.json").exists() and not finished:
+            raise UserError(f"{out} holds other results: choose another --out")
         if recording is None:
             paths = {task: Path(args.data) / f"{task}.npz" for task in tasks}
         else:

@@ -70,12 +70,12 @@ Arrays = dict[str, np.ndarray]
 class Settings:
     """What a training is made of.
 
-    The defaults are of baselines that others have written for Meta-World's benchmark, and these
-    differ. Garage's has layers of 128, as here, an inner rate of 1e-4 on advantages that are not
-    normalized, and bounds the standard deviation. Later ones have layers of 512, and, as here, a
-    rate of 0.1, normalized advantages, and a deviation that begins at 1 and is free. Unlike in
-    these, an episode is as long as elsewhere in this project, 200 steps where they have 500, and
-    goals are drawn anew in each iteration where the benchmark has 50 of each task.
+    The defaults come from two baselines that others have written for Meta-World's benchmark, and
+    that differ. From Garage's come layers of 128; it has an inner rate of 1e-4, advantages that are
+    not normalized, and a bounded standard deviation. From a later one, whose layers have 512, come
+    a rate of 0.1, normalized advantages, and a deviation that begins at 1 and is free. Two things
+    are ours: an episode has 200 steps, as elsewhere in this project, where both have 500; and goals
+    are drawn anew in each iteration, where the benchmark has 50 of each task.
     """
 
     seed: int = setting(0, "of weights, goals and actions in training", least=0, most=999)
@@ -107,7 +107,7 @@ class GaussianPolicy(nn.Module):
     """States to a Gaussian of actions, whose standard deviation is the same everywhere.
 
     Weights begin as those of Glorot and Bengio (2010), as in other implementations. PyTorch's own
-    are smaller in all layers but the first, and then an inner step hardly changes the actions.
+    are smaller, most of all in the last layer, and then an inner step hardly changes the actions.
     """
 
     def __init__(self, state_dim: int, action_dim: int, hidden: int):

@@ -2053,11 +2053,16 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
 def check_reference(pose: np.ndarray, settings: Settings) -> None:
     """Raises RobotError if the rotation vector of a pose (6,) may flip while the arm works.
 
-    Both vectors of a tool that points down are 4.4 from rotation_near_rad if that points down, too,
-    but is yawed by half a turn: then each tremor makes the other one the nearer.
+    Where both vectors of the tool's rotation are about as far from rotation_near_rad, each tremor
+    makes the other one the nearer.
     """
     reference = np.array(settings.rotation_near_rad)
-    if np.linalg.norm(nearer(pose[3:], reference) - reference) > 3.6:
+    near = nearer(pose[3:], reference)
+    angle = np.linalg.norm(near)
+    if angle == 0:
+        return
+    other = near * (1 - 2 * np.pi / angle)
+    if np.linalg.norm(other - reference) - np.linalg.norm(near - reference) < 1.5:
         raise RobotError(f"the rotation vector may flip: {write_rotation(pose[3:])}")
 
 

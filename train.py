@@ -1199,6 +1199,8 @@ def run(
             if rank == 0 and (milestone or stopping or saver.is_due()):
                 saver.save(state)
             if stopping:
+                if world > 1:
+                    dist.barrier()  # or torchrun would end rank 0, which may still be saving
                 raise KeyboardInterrupt(f"saved after step {state.step}, add --resume to go on")
             if rank == 0:
                 outcomes = evaluation.run(state.step, stop)

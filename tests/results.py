@@ -609,7 +609,7 @@ HIDDEN_SUMMARY = {  # the most important of these rows -> their titles in README
     "with the goal's own, trained for twice as many steps": (
         "a demonstration of the goal, twice as many steps of training"
     ),
-    "these, from 20 starts": "these, from 20 starts in place of five",
+    "these, from 20 starts": "trained so, from 20 starts in place of five",
     "with another goal's": "a demonstration of another goal",
     "with zeros in its place": "zeros in its place",
     "second order: before any step": "no demonstration, second-order MAML: before any step",

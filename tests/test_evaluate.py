@@ -717,7 +717,7 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
     assert "mean, last checkpoint: " in printed
 
 
-def test_base_tasks_are_those_that_the_policy_was_trained_on(run, recordings):
+def test_base_tasks_are_those_that_the_policy_was_trained_on(run, recordings, capsys):
     content = torch.load(run / "ema-00006.pt", weights_only=True)
     content["arguments"] |= {"base_tasks": 1, "seed": 0}
     torch.save(content, run / "ema-00006.pt")
@@ -725,6 +725,14 @@ def test_base_tasks_are_those_that_the_policy_was_trained_on(run, recordings):
     [trained] = simulator.draw_base_tasks(TASKS, 1, seed=0)
     [measured] = report_of("report")["successes"].values()
     assert list(measured) == [trained]
+
+    # Beside one that was trained on the other task
+    other = next(s for s in range(9) if simulator.draw_base_tasks(TASKS, 1, seed=s) != [trained])
+    content["arguments"]["seed"] = other
+    Path("other").mkdir()
+    torch.save(content, "other/ema-00006.pt")
+    both = [*command(run, recordings, "--episodes 1 --out both"), "--checkpoint", str(run), "other"]
+    assert "other/ema-00006.pt was trained on other base tasks" in fails(evaluate, both, capsys)
 
 
 def test_the_best_checkpoints_of_a_run_are_averaged(run, recordings, monkeypatch, capsys):

@@ -480,6 +480,13 @@ def test_resuming_several_tasks_removes_no_policy_of_one(run, recorded, capsys):
     )
     assert fingerprint(Path("one")) == before
 
+    # Nor a report of evaluate.py
+    Path("measured").mkdir()
+    Path("measured/success.json").write_text("{}")
+    several = adapting(run, recorded, "--episodes 0 --out measured --resume", "door-close reach")
+    assert "measured holds other results" in fails(finetune, several, capsys)
+    assert Path("measured/success.json").exists()
+
 
 def test_a_folder_in_use_is_not_written_into(run, recorded, capsys):
     with common.locked(Path("busy")):

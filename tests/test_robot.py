@@ -1317,6 +1317,27 @@ def test_check_reports_everything_and_moves_nothing(emulator, cell, capsys):
     assert all(frame[1] == 3 for frame in emulator.gripper_frames)  # reads only
 
 
+@pytest.mark.parametrize(
+    "near, rotation, may_flip",
+    [
+        ((0, np.pi, 0), (0, 3.1, 0), False),
+        ((0, np.pi, 0), (np.pi / 2, 0, 0), False),  # level: both vectors fit, one clearly better
+        ((0, np.pi, 0), (0, 0, 0), False),
+        ((0, np.pi, 0), (3.1, 0, 0), True),  # as far from either
+        ((0, 0, 0), (3.1, 0, 0), True),
+        ((0.5, 0, 0), (0, 3.1, 0), True),
+    ],
+)
+def test_a_reference_as_far_from_both_vectors_of_a_rotation_is_told(
+    near, rotation, may_flip, settings
+):
+    expected = pytest.raises(RobotError, match="may flip") if may_flip else contextlib.nullcontext()
+    with expected:
+        robot.check_reference(
+            np.array([0, 0, 0, *rotation]), replace(settings, rotation_near_rad=near)
+        )
+
+
 def test_one_check_of_poses_decides_wherever_they_come_from(
     emulator, settings, cell, monkeypatch, capsys
 ):

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -706,6 +707,7 @@ def test_two_processes_under_torchrun_train_as_one_does(pair, tmp_path):
         [*launcher, *argv, "--out", str(tmp_path / "two")], capture_output=True, text=True
     )
     assert two.returncode == 0, two.stderr
+    assert json.loads((tmp_path / "two/config.json").read_text())["processes of torchrun"] == 2
     train.main([*argv, "--out", str(tmp_path / "one")])
     for one, both in zip(metrics(tmp_path / "one"), metrics(tmp_path / "two"), strict=True):
         assert both["loss"] == pytest.approx(one["loss"], rel=1e-4)
@@ -726,6 +728,32 @@ def test_two_processes_under_torchrun_train_as_one_does(pair, tmp_path):
     moved = all_weights(one) - all_weights(start.state_dict())
     assert (all_weights(one) - all_weights(two)).norm() < 1e-3 * moved.norm()
     assert moved.norm() > 0.1
+
+
+def child_of_rank(launcher, rank):
+    """The process of torchrun that has this rank; None before it has started."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+            environment = (stat.parent / "environ").read_bytes().split(b"\0")
+            if parent == launcher and f"RANK={rank}".encode() in environment:
+                return int(stat.parent.name)
+    return None
+
+
+def test_a_signal_to_one_of_torchruns_processes_stops_and_saves_all(pair, tmp_path):
+    argv = [*SHORT, "--steps", "100000", "--data", str(pair), "--out", str(tmp_path / "run")]
+    words = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    with subprocess.Popen([*words, str(ROOT / "train.py"), *argv], stderr=subprocess.PIPE) as two:
+        log, deadline = tmp_path / "run" / "metrics.jsonl", time.monotonic() + 120
+        while not log.exists() or len(metrics(log.parent)) < 3:
+            assert two.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        os.kill(child_of_rank(two.pid, 1), signal.SIGINT)
+        errors = two.stderr.read().decode()
+    done = metrics(log.parent)[-1]["step"]
+    assert f"interrupted: saved after step {done}, add --resume to go on" in errors
+    assert whole_state(log.parent)["step"] == done
 
 
 # ---- Learned rates of the inner step -------------------------------------------------------------
