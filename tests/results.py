@@ -733,6 +733,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "pairs": pairs_table,
     "turned actions": lambda results: turned_actions_table(results, "reach"),
     "means": lambda results: means_table(results, "ml10"),
+    "rl": rl_table,
     "base": lambda results: by_task_table(results, "base", "ml10"),
     "novel": lambda results: by_task_table(results, "novel", "ml10"),
     "old variants": variants_table,
