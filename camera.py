@@ -168,9 +168,9 @@ class RayCastCamera:
         site_colors = drawn_colors(model, "site", groups)
         self.colors = np.concatenate([geom_colors[:, :3], site_colors[:, :3], [SKY]])
 
-        # The model as rays are to see it. `mj_multiRay` skips a body whose bounding volume a
-        # ray misses. But that volume is made for collisions, and lacks the geoms that take no part
-        # in them. Without one, each ray is tested against each geom, as `mj_ray` does.
+        # The model as rays are to see it. `mj_multiRay` skips a body whose bounding volume a ray
+        # misses. But that volume is made for collisions, and lacks the geoms that take no part in
+        # them. Without one, each ray is tested against each geom, as `mj_ray` does.
         self.view = copy.copy(model)
         self.view.body_bvhadr[:] = -1
         self.view.geom_rgba[:] = geom_colors

@@ -9,9 +9,9 @@ CoppeliaSim.
 
 The paper trains on 25 tasks and adapts to 5 others. It does not say which of a task's variations it
 uses; here a task is its first one. Demonstrations are imported, since RLBench plans whole paths and
-has no expert that acts step by step. All rollouts of a task are shown the same
-demonstration, as in the paper. States, actions and clouds are those of rlbench_data.py, so that
-recordings and environment agree.
+has no expert that acts step by step. All rollouts of a task are shown the same demonstration, as in
+the paper. States, actions and clouds are those of rlbench_data.py, so that recordings and
+environment agree.
 
 The seed of an episode sets NumPy's global generator, from which RLBench draws where things are and
 which colours they have: the same seed draws the same start. There are two exceptions. RLBench draws

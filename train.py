@@ -1260,7 +1260,9 @@ def main(argv: Sequence[str] | None = None) -> None:
                 if novel_paths:
                     n = simulator.demonstrations
                     collect(simulator, list(novel_paths), data, episodes=n, workers=args.workers)
+        provenance = common.provenance("train.py", argv, device)
         if world > 1:
+            provenance["processes of torchrun"] = world
             dist.barrier()
         run(
             args=args,
@@ -1270,10 +1272,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             paths=paths,
             evaluated_paths=novel_paths or paths,
             folder=folder,
-            provenance={
-                **common.provenance("train.py", argv, device),
-                **({"processes of torchrun": world} if world > 1 else {}),
-            },
+            provenance=provenance,
             device=device,
             rank=rank,
             world=world,

@@ -719,7 +719,7 @@ def test_base_tasks_are_measured_and_the_report_says_how(run, recordings, capsys
 
 def test_base_tasks_are_those_that_the_policy_was_trained_on(run, recordings, capsys):
     content = torch.load(run / "ema-00006.pt", weights_only=True)
-    content["arguments"] |= {"base_tasks": 1, "seed": 0}
+    content["arguments"].update(base_tasks=1, seed=0)
     torch.save(content, run / "ema-00006.pt")
     evaluate.main(command(run, recordings, "--episodes 1 --out report"))
     [trained] = simulator.draw_base_tasks(TASKS, 1, seed=0)

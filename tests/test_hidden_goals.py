@@ -71,16 +71,18 @@ def test_in_meta_worlds_own_ml1_a_replay_of_the_actions_is_enough():
 
     successes = []
     for task in benchmark.test_tasks[:5]:
-        expert, observation, actions = ENV_POLICY_MAP["push-v3"](), begin(task), []
-        start, by_expert, by_replay = observation, False, False
+        expert = ENV_POLICY_MAP["push-v3"]()
+        observation = start = begin(task)
+        actions = []
+        by_expert = by_replay = False
         for _ in range(100):
             actions.append(np.clip(expert.get_action(observation), -1, 1))
             observation, _, _, _, info = env.step(actions[-1])
-            by_expert |= bool(info["success"])
+            by_expert = by_expert or bool(info["success"])
         assert np.array_equal(begin(task), start)
         for action in actions:
             _, _, _, _, info = env.step(action)
-            by_replay |= bool(info["success"])
+            by_replay = by_replay or bool(info["success"])
         assert by_replay == by_expert
         successes.append(by_replay)
     assert sum(successes) >= 4
