@@ -43,14 +43,15 @@ import warnings
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+import PIL.Image
 
 import rlbench_data
 from common import UserError, command_line, progress_bar
@@ -58,7 +59,9 @@ from data import (
     NAME,
     Demonstrations,
     RecordingError,
+    check_file,
     farthest_point_sample,
+    is_numbers,
     load_demonstrations,
     save_demonstrations,
     suspicions,
@@ -82,34 +85,48 @@ def refuse_damaged(path: Path, error: Exception, expected: str) -> NoReturn:
     refuse(path, f"is damaged or {expected}: {reason}; download it again")
 
 
+@contextmanager
+def reading(path: Path, expected: str) -> Iterator[None]:
+    """Stands around one call of a library: whatever that raises, the file cannot be read."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # each library raises types of its own
+        refuse_damaged(path, error, expected)
+
+
 def readable(items: Iterator[Any], path: Path, expected: str) -> Iterator[Any]:
     """What a library reads of a file, piece by piece; RecordingError where it cannot."""
+    end = object()
     while True:
-        try:
-            item = next(items)
-        except StopIteration:
+        with reading(path, expected):
+            item = next(items, end)
+        if item is end:
             return
-        except (OSError, ValueError) as error:  # those of pyarrow and PyAV are among them
-            refuse_damaged(path, error, expected)
         yield item
 
 
 def package(name: str, path: Path) -> Any:
-    """A package that is installed by who needs it."""
+    """An optional package; RecordingError says how to install it."""
     try:
         return import_module(name)
     except ImportError:
-        top = {"PIL": "pillow"}.get(name.split(".")[0], name.split(".")[0])
+        top = name.split(".")[0]
         refuse(path, f"{top} is needed to read it: pip install {top}")
 
 
 def read_json(path: Path) -> dict[str, Any]:
+    """The object that a file holds; RecordingError if it holds none."""
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        value = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         refuse(path, f"cannot be read: {error.strerror}")
-    except (TypeError, ValueError) as error:
+    except (ValueError, RecursionError) as error:
         refuse(path, f"is no JSON object: {error}")
+    if not isinstance(value, dict):
+        refuse(path, f"is no JSON object, but {type(value).__name__}")
+    return value
 
 
 # ---- What readers get and yield ------------------------------------------------------------------
@@ -137,9 +154,7 @@ class Camera:
             value, shape = getattr(self, f.name), shapes.get(f.name, (3,))
             if value is None:
                 continue
-            numbers = np.array(value, dtype=object)
-            fits = numbers.shape == shape and all(type(x) in (int, float) for x in numbers.flat)
-            if not fits or not all(math.isfinite(x) for x in numbers.flat):
+            if not is_numbers(value, shape):
                 count = " x ".join(map(str, shape)) or "1"
                 raise ValueError(f"{f.name}: give {count} finite numbers")
         if self.intrinsics is not None and min(self.intrinsics[:2]) <= 0:
@@ -186,12 +201,12 @@ class Frame:
     instruction: Any  # what is done; None: the source does not say
     state: np.ndarray  # (S,)
     action: np.ndarray  # (A,)
-    cloud: Callable[[], np.ndarray]  # makes (M, P); positions may be NaN, colors stand in 3 to 5
+    cloud: np.ndarray  # (M, P); positions may be NaN, colors stand in 3 to 5
     name: str | None = None  # of the task; None: it is made of the instruction
 
 
-def unread_episode(episode: int) -> Frame:
-    """One frame in the place of an episode that --skip names, so that the episode is counted."""
+def skipped_frame(episode: int) -> Frame:
+    """Stands for a frame of an episode that --skip names, so that the episode is counted."""
     nothing = np.zeros(0)
     return Frame(
         episode=episode,
@@ -201,7 +216,7 @@ def unread_episode(episode: int) -> Frame:
         instruction=None,
         state=nothing,
         action=nothing,
-        cloud=lambda: nothing,
+        cloud=nothing,
     )
 
 
@@ -251,31 +266,42 @@ def as_cloud(path: Path, array: np.ndarray) -> np.ndarray:
 
 
 def depth_cloud(
-    depth: np.ndarray,
+    path: Path,
+    row: dict[str, np.ndarray],
     *,
+    depth: str,
     scale: float,
-    intrinsics: list[float],
-    color: np.ndarray | None = None,
-    pose: np.ndarray | None = None,
+    camera: Camera,
+    color: str | None = None,
+    intrinsics: str | None = None,
+    extrinsics: str | None = None,
 ) -> np.ndarray:
-    """Depth (H, W), in units of `scale` metres, -> the points of the pixels that have depth.
+    """The points of the pixels that have depth, (M, 3) float32, or (M, 6) with colors.
 
-    `color` (H, W, 3) is that of the same pixels, `pose` (4, 4) that of the camera. Returns (M, 3),
-    or (M, 6) with colors. Warns of intrinsics that seem to be of another resolution.
+    Args:
+        row: name -> array of one frame. `depth`, `color`, `intrinsics` and `extrinsics` are names.
+        scale: metres a unit of depth.
+        camera: if it has intrinsics, they come before those of the row.
     """
-    if is_off_center(intrinsics, depth):
-        H, W = depth.shape
+    image = depth_image(path, depth, row[depth])  # (H, W)
+    lens = camera.intrinsics
+    if lens is None:
+        lens = intrinsics_of(path, intrinsics, row[intrinsics], image)
+    elif is_off_center(lens, image):
+        H, W = image.shape
         warnings.warn(  # Python shows it once
-            f"the principal point, {intrinsics[2]:g}, {intrinsics[3]:g}, is far from the middle of "
+            f"the principal point, {lens[2]:g}, {lens[3]:g}, is far from the middle of "
             f"the depth, {W} x {H}: are the intrinsics of --camera those of this resolution?",
             stacklevel=1,
         )
-    metres = depth.astype(np.float32) * np.float32(scale)
-    points = depth_to_points(metres, intrinsics)
+    metres = image.astype(np.float32) * np.float32(scale)
+    points = depth_to_points(metres, lens)  # (M, 3)
     if color is not None:
-        seen = has_depth(metres)
-        points = np.concatenate([points, color[seen].astype(np.float32)], axis=1)
-    return points if pose is None else transform(points, pose)
+        pixels = color_image(path, color, row[color], image)[has_depth(metres)]  # (M, 3)
+        points = np.concatenate([points, pixels.astype(np.float32)], axis=1)
+    if extrinsics is not None:  # from world to camera
+        points = transform(points, camera_pose(path, extrinsics, row[extrinsics]))
+    return points
 
 
 def depth_image(path: Path, name: str, array: np.ndarray) -> np.ndarray:
@@ -302,27 +328,10 @@ def color_image(path: Path, name: str, color: np.ndarray, depth: np.ndarray) -> 
 
 # What the name of an array may say beside which camera it is of. Not "color": the intrinsics of a
 # color image are not those of depth.
-NO_CAMERA = {
-    "obs",
-    "observation",
-    "observations",
-    "images",
-    "image",
-    "sensor",
-    "data",
-    "param",
-    "params",
-    "camera",
-    "cam",
-    "depth",
-    "intrinsic",
-    "intrinsics",
-    "extrinsic",
-    "extrinsics",
-    "cv",
-    "k",
-    "matrix",
-}
+NO_CAMERA = set(
+    "obs observation observations images image sensor data param params camera cam depth "
+    "intrinsic intrinsics extrinsic extrinsics cv k matrix".split()
+)
 
 
 def camera_of(name: str) -> set[str]:
@@ -443,14 +452,21 @@ def choose_array(
     refuse(path, f"{problem}; it holds {there}")
 
 
-def refuse_name_of_color(path: Path, options: Options) -> None:
+def check_color_has_no_name(path: Path, options: Options) -> None:
     """RecordingError for `--color NAME` where the points have colors of their own."""
     if options.color:
         refuse(
             path,
-            "a color is named where points have none beside them: write --color alone if they have "
-            "six numbers, or leave it out",
+            "--color takes no name here: write --color alone if the points have six numbers, or "
+            "leave it out",
         )
+
+
+def check_flags(path: Path, options: Options, kind: str, useless: tuple[str, ...]) -> None:
+    """RecordingError if a flag was given that has no meaning for a source of this kind."""
+    for flag in useless:
+        if getattr(options, flag):
+            refuse(path, f"is {kind}, for which --{flag} has no meaning: leave it out")
 
 
 # ---- DP3's zarr ----------------------------------------------------------------------------------
@@ -465,13 +481,12 @@ IN_ZARR = {
 
 def read_zarr(path: Path, options: Options) -> Source:
     """A replay buffer of DP3."""
+    check_flags(path, options, "a zarr of DP3", ("feature", "state", "wrist"))
     arrays, unread = open_zarr(path)
     check_zarr(path, arrays)
-    refuse_name_of_color(path, options)
-    try:
+    check_color_has_no_name(path, options)
+    with reading(path, "no zarr"):
         ends, state, action = (arrays[part][:] for part in ("ends", "state", "action"))
-    except Exception as error:
-        refuse_damaged(path, error, "no zarr")
     if ends.dtype.kind not in "iu" or ends.ndim != 1 or (np.diff(ends, prepend=0) <= 0).any():
         refuse(path, "meta/episode_ends must be growing whole numbers")
     lengths = {name: arrays[part].shape[0] for part, name in IN_ZARR.items() if part != "ends"}
@@ -480,20 +495,22 @@ def read_zarr(path: Path, options: Options) -> Source:
         refuse(path, f"lengths differ: {lengths}")
 
     def frames() -> Iterator[Frame]:
-        starts = [0, *ends.tolist()]
-        clouds = readable(zarr_rows(arrays["points"]), path, "no zarr")
-        for i, cloud in enumerate(clouds):
-            episode = int(np.searchsorted(ends, i, side="right"))
-            yield Frame(
-                episode=episode,
-                index=i - starts[episode],
-                time=None,
-                task=0,
-                instruction=None,
-                state=state[i].ravel(),
-                action=action[i].ravel(),
-                cloud=partial(as_cloud, path, cloud),
-            )
+        clouds = zarr_rows(path, arrays["points"])
+        for episode, (start, end) in enumerate(pairwise([0, *ends.tolist()])):
+            for i, cloud in zip(range(start, end), clouds):
+                if episode in options.skip:
+                    yield skipped_frame(episode)
+                    continue
+                yield Frame(
+                    episode=episode,
+                    index=i - start,
+                    time=None,
+                    task=0,
+                    instruction=None,
+                    state=state[i].ravel(),
+                    action=action[i].ravel(),
+                    cloud=as_cloud(path, cloud),
+                )
 
     return Source(frames=frames(), total_frames=lengths["meta/episode_ends"], unread=unread)
 
@@ -501,7 +518,7 @@ def read_zarr(path: Path, options: Options) -> Source:
 def open_zarr(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     """The arrays of `IN_ZARR` that a folder or zip file has, and the names of others in data/."""
     zarr = package("zarr", path)
-    try:
+    with reading(path, "neither zarr, HDF5 nor a dataset of LeRobot"):
         if path.is_dir():
             group = zarr.open_group(path, mode="r")
         else:
@@ -509,9 +526,7 @@ def open_zarr(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
             group = zarr.open_group(store, mode="r", path=folder_in_zip(path))
         arrays = {part: group[name] for part, name in IN_ZARR.items() if name in group}
         stored = [f"data/{name}" for name in group["data"]] if "data" in group else []
-        return arrays, tuple(sorted(set(stored) - set(IN_ZARR.values())))
-    except Exception as error:  # zarr raises many types; each means it cannot be read
-        refuse_damaged(path, error, "neither zarr, HDF5 nor a dataset of LeRobot")
+    return arrays, tuple(sorted(set(stored) - set(IN_ZARR.values())))
 
 
 def check_zarr(path: Path, arrays: dict[str, Any]) -> None:
@@ -519,7 +534,8 @@ def check_zarr(path: Path, arrays: dict[str, Any]) -> None:
     if missing := [name for part, name in IN_ZARR.items() if part not in arrays]:
         refuse(path, f"it lacks {', '.join(missing)}: DP3 has {', '.join(IN_ZARR.values())}")
     for part, array in arrays.items():
-        if getattr(array, "dtype", np.dtype("O")).kind not in "fiu":  # zarr may unpickle objects
+        # A group has no dtype, and of an array of objects zarr would unpickle the elements.
+        if not hasattr(array, "dtype") or array.dtype.kind not in "fiu" or array.ndim == 0:
             refuse(path, f"{IN_ZARR[part]} must be plain numbers")
     # zarr fills what is missing with zeros. Actions may be zeros, and such chunks are not stored.
     for part in ("points", "state"):
@@ -533,13 +549,11 @@ def check_zarr(path: Path, arrays: dict[str, Any]) -> None:
             )
 
 
-def zarr_rows(array: Any) -> Iterator[np.ndarray]:
+def zarr_rows(path: Path, array: Any) -> Iterator[np.ndarray]:
     """The rows of an array, of which not all need fit into memory."""
     for start in range(0, array.shape[0], 64):
-        try:
+        with reading(path, "no zarr"):
             rows = array[start : start + 64]
-        except Exception as error:  # zarr and its codecs raise many types
-            raise OSError(error) from error
         yield from rows
 
 
@@ -557,6 +571,7 @@ def folder_in_zip(path: Path) -> str:
 
 def read_lerobot(path: Path, options: Options) -> Source:
     """A dataset of LeRobot."""
+    check_flags(path, options, "a dataset of LeRobot", ("state", "wrist"))
     package("pyarrow.parquet", path)
     info = read_lerobot_info(path)
     dataset = LeRobot(path, info, options)
@@ -613,6 +628,7 @@ class LeRobot:
 
     def __init__(self, path: Path, info: dict[str, Any], options: Options) -> None:
         self.path, self.info, self.camera = path, info, options.camera
+        self.skip = options.skip
         self.features = info["features"]
         self.episodes = self.read_episodes()
         self.tasks = {} if options.instruction else self.read_tasks()
@@ -631,7 +647,7 @@ class LeRobot:
             raise RecordingError(f"{error}{', and ' + pictures if pictures else ''}") from None
         self.color = self.intrinsics = None
         if not self.is_depth:
-            refuse_name_of_color(path, options)
+            check_color_has_no_name(path, options)
         else:
             self.intrinsics = self.choose_intrinsics()
             self.scale = self.read_scale()
@@ -716,19 +732,15 @@ class LeRobot:
 
     def open_parquet(self, file: Path) -> Any:
         parquet = package("pyarrow.parquet", self.path)
-        try:
+        with reading(file, "no parquet file"):
             return parquet.ParquetFile(file)
-        except (OSError, ValueError) as error:  # those of pyarrow are among them
-            refuse_damaged(file, error, "no parquet file")
 
     def read_table(self, file: Path) -> Any:
         """A whole table of meta/, but for the statistics in it."""
         stored = self.open_parquet(file)
         columns = [n for n in stored.schema_arrow.names if not n.startswith("stats/")]
-        try:
+        with reading(file, "no parquet file"):
             return stored.read(columns=columns)
-        except (OSError, ValueError) as error:
-            refuse_damaged(file, error, "no parquet file")
 
     def read_episodes(self) -> dict[int, dict[str, Any]]:
         """episode -> what meta/ says of it: its length, and where in the videos it stands."""
@@ -794,6 +806,9 @@ class LeRobot:
         for i in range(len(columns["action"])):
             row = {name: values[i] for name, values in columns.items()}
             episode = int(row["episode_index"].item())
+            if episode in self.skip:
+                yield skipped_frame(episode)
+                continue
             index = int(row["frame_index"].item()) if "frame_index" in row else None
             time = float(row["timestamp"].item()) if "timestamp" in row else None
             task = int(row["task_index"].item())
@@ -805,7 +820,7 @@ class LeRobot:
                 instruction=self.tasks.get(task),
                 state=row["observation.state"].ravel(),
                 action=row["action"].ravel(),
-                cloud=partial(self.make_cloud, file, row, episode, time),
+                cloud=self.make_cloud(file, row, episode, time),
             )
 
     def make_cloud(
@@ -814,25 +829,25 @@ class LeRobot:
         """The cloud of a row: as it is stored, or of its depth."""
         if not self.is_depth:
             return as_cloud(file, row[self.cloud])
+        row = dict(row)  # with pictures decoded
         if self.is_video(self.cloud):
             codes = self.videos[self.cloud].at(episode, time, "gray12le")
-            depth = dequantize(codes, **self.quantizer)
+            row[self.cloud] = dequantize(codes, **self.quantizer)
         elif self.is_picture(self.cloud):
-            depth = decode_image(file, row[self.cloud], None)
-        else:
-            depth = row[self.cloud]
-        depth = depth_image(file, self.cloud, depth)
-        color = None
-        if self.color is not None:
-            if self.color in self.videos:
-                color = self.videos[self.color].at(episode, time, "rgb24")
-            else:
-                color = decode_image(file, row[self.color], "RGB")
-            color = color_image(file, self.color, color, depth)
-        intrinsics = self.camera.intrinsics
-        if intrinsics is None:
-            intrinsics = intrinsics_of(file, self.intrinsics, row[self.intrinsics], depth)
-        return depth_cloud(depth, scale=self.scale, intrinsics=intrinsics, color=color)
+            row[self.cloud] = decode_image(file, row[self.cloud], None)
+        if self.color in self.videos:
+            row[self.color] = self.videos[self.color].at(episode, time, "rgb24")
+        elif self.color is not None:
+            row[self.color] = decode_image(file, row[self.color], "RGB")
+        return depth_cloud(
+            file,
+            row,
+            depth=self.cloud,
+            scale=self.scale,
+            camera=self.camera,
+            color=self.color,
+            intrinsics=self.intrinsics,
+        )
 
 
 def natural(file: Path) -> list[int]:
@@ -842,23 +857,17 @@ def natural(file: Path) -> list[int]:
 
 def read_all_json_lines(path: Path) -> list[dict[str, Any]]:
     """The objects of a file, one a line; RecordingError where a line is none."""
-    try:
+    with reading(path, "no JSON, line by line"):
         lines = path.read_text(encoding="utf-8").splitlines()
         return [dict(json.loads(line)) for line in lines if line.strip()]
-    except (TypeError, ValueError) as error:
-        refuse_damaged(path, error, "no JSON, line by line")
 
 
 def decode_image(path: Path, data: Any, mode: str | None) -> np.ndarray:
     """An encoded image: (H, W) as it is for a depth map, or (H, W, 3) for the mode RGB."""
-    image = package("PIL.Image", path)
     if not isinstance(data, bytes):
         refuse(path, "its images are not in the file itself: download it with its images")
-    try:
-        with image.open(io.BytesIO(data)) as opened:
-            return np.asarray(opened.convert(mode) if mode else opened)
-    except (OSError, ValueError) as error:
-        refuse_damaged(path, error, "holds no images")
+    with reading(path, "holds no images"), PIL.Image.open(io.BytesIO(data)) as opened:
+        return np.asarray(opened.convert(mode) if mode else opened)
 
 
 def dequantize(
@@ -914,10 +923,8 @@ class Video:
         """Times and pictures of a file; depth must have 12 bits, or it was scaled by an encoder."""
         if not file.is_file():
             refuse(file, "is missing: download it again")
-        try:
+        with reading(file, "no video"):
             container = self.av.open(str(file))
-        except (OSError, ValueError) as error:
-            refuse_damaged(file, error, "no video")
         with container:
             for picture in readable(container.decode(video=0), file, "no video"):
                 if pixel_format == "gray12le" and picture.format.components[0].bits != 12:
@@ -940,17 +947,16 @@ OF_DAMAGED_HDF5 = (OSError, KeyError, RuntimeError, ValueError)  # what h5py rai
 
 def read_hdf5(path: Path, options: Options) -> Source:
     """Demonstrations of robomimic (data/demo_0 ...) or ManiSkill (traj_0 ...)."""
+    check_flags(path, options, "a file of HDF5", ("wrist",))
     h5py = package("h5py", path)
     groups = {}
-    try:
+    with reading(path, "no HDF5 file"):
         file = h5py.File(path, "r")
         parent = file["data"] if isinstance(file.get("data"), h5py.Group) else file
         for name in parent:
             number = re.fullmatch(r"(?:demo|traj|episode)_(\d+)", name)
             if number and isinstance(parent.get(name), h5py.Group):
                 groups[int(number[1])] = parent[name]
-    except OF_DAMAGED_HDF5 as error:
-        refuse_damaged(path, error, "no HDF5 file")
     groups = dict(sorted(groups.items()))
     if not groups:
         refuse(path, f"holds no data/demo_0 or traj_0; it holds {', '.join(file)}")
@@ -979,10 +985,8 @@ def hdf5_arrays(path: Path, group: Any) -> dict[str, Any]:
         if hasattr(item, "shape") and item.ndim > 0 and item.dtype.kind in "fiu":
             found[name] = item
 
-    try:
+    with reading(path, "no HDF5 file"):
         group.visititems(visit)
-    except OF_DAMAGED_HDF5 as error:
-        refuse_damaged(path, error, "no HDF5 file")
     return found
 
 
@@ -1001,7 +1005,8 @@ def hdf5_lengths(path: Path, groups: dict[int, Any]) -> dict[int, int]:
     lengths = {episode: length for episode, length in lengths.items() if length is not None}
     beside = path.with_suffix(".json")
     if not lengths and beside.is_file():
-        for row in read_json(beside).get("episodes", []):
+        rows = read_json(beside).get("episodes")
+        for row in rows if isinstance(rows, list) else []:
             if not isinstance(row, dict):
                 continue
             episode, length = row.get("episode_id"), row.get("elapsed_steps")
@@ -1039,7 +1044,7 @@ class HDF5:
         shape = observed[self.cloud]
         has_color = not self.is_depth and shape[cloud_axis(shape)] >= 6  # in the points themselves
         if has_color:
-            refuse_name_of_color(path, options)
+            check_color_has_no_name(path, options)
         elif options.color is not None:
             self.color = self.choose_color(pictures, options.color)
         if self.is_depth:
@@ -1086,24 +1091,22 @@ class HDF5:
         """The frames of all episodes; an observation after the last action is left out."""
         for episode, group in groups.items():
             if episode in skip:
-                yield unread_episode(episode)
+                yield skipped_frame(episode)
                 continue
             arrays = hdf5_arrays(self.path, group)
             T = len(arrays["actions"]) if "actions" in arrays else 0
             advice = f"leave it out by --skip {episode}"
             if T == 0:
                 refuse(self.path, f"episode {episode} has no actions: {advice}")
-            for name in self.read - {None}:
+            for name in sorted(self.read - {None}):
                 if name not in arrays or len(arrays[name]) not in (T, T + 1):
                     refuse(
                         self.path,
                         f"episode {episode} has {T} actions, but not as many of {name}: {advice}",
                     )
-            try:
+            with reading(self.path, "no HDF5 file"):
                 action = arrays["actions"][:].reshape(T, -1)
                 parts = [arrays[name][:T].reshape(T, -1) for name in self.state]
-            except OF_DAMAGED_HDF5 as error:
-                refuse_damaged(self.path, error, "no HDF5 file")
             state = np.concatenate(parts, axis=1)
             for i in range(T):
                 yield Frame(
@@ -1114,28 +1117,26 @@ class HDF5:
                     instruction=instruction,
                     state=state[i],
                     action=action[i],
-                    cloud=partial(self.make_cloud, arrays, i),
+                    cloud=self.make_cloud(arrays, i),
                 )
 
     def make_cloud(self, arrays: dict[str, Any], i: int) -> np.ndarray:
         """The cloud of frame i of an episode: as it is stored, or of its depth."""
         names = {self.cloud, self.color, self.intrinsics, self.extrinsics} - {None}
-        try:
+        with reading(self.path, "no HDF5 file"):
             row = {name: arrays[name][i] for name in names}
-        except OF_DAMAGED_HDF5 as error:
-            refuse_damaged(self.path, error, "no HDF5 file")
         if not self.is_depth:
             return self.colored_cloud(row)
-        depth = depth_image(self.path, self.cloud, row[self.cloud])
-        color = pose = None
-        if self.color is not None:
-            color = color_image(self.path, self.color, row[self.color], depth)
-        if self.extrinsics is not None:  # from world to camera
-            pose = camera_pose(self.path, self.extrinsics, row[self.extrinsics])
-        intrinsics = self.camera.intrinsics
-        if intrinsics is None:
-            intrinsics = intrinsics_of(self.path, self.intrinsics, row[self.intrinsics], depth)
-        return depth_cloud(depth, scale=self.scale, intrinsics=intrinsics, color=color, pose=pose)
+        return depth_cloud(
+            self.path,
+            row,
+            depth=self.cloud,
+            scale=self.scale,
+            camera=self.camera,
+            color=self.color,
+            intrinsics=self.intrinsics,
+            extrinsics=self.extrinsics,
+        )
 
     def colored_cloud(self, row: dict[str, np.ndarray]) -> np.ndarray:
         """A stored cloud, with the colors that stand beside it."""
@@ -1156,6 +1157,7 @@ class HDF5:
 
 def read_rlbench(path: Path, options: Options) -> Source:
     """A data set of RLBench, or one of its tasks or variations."""
+    check_flags(path, options, "a data set of RLBench", ("feature", "state"))
     camera = options.camera
     if (camera.intrinsics, camera.depth_scale, camera.camera_to_base) != (None, None, None):
         refuse(path, "says itself how its cameras stand: of --camera only the crop box is used")
@@ -1188,7 +1190,7 @@ def rlbench_frames(
     tasks: dict[str, int] = {}  # name -> its number
     for number, episode in enumerate(episodes):
         if number in options.skip:
-            yield unread_episode(number)
+            yield skipped_frame(number)
             continue
         moments = rlbench_data.read_moments(episode)
         if len(moments) < 2:
@@ -1213,11 +1215,8 @@ def rlbench_frames(
                 instruction=described,
                 state=moment.state,
                 action=rlbench_data.action_between(moment.state, following.state),
-                cloud=partial(
-                    rlbench_cloud,
-                    moment,
-                    {camera: files[camera][i] for camera in cameras},
-                    workspace,
+                cloud=rlbench_cloud(
+                    moment, {camera: files[camera][i] for camera in cameras}, workspace
                 ),
                 name=name,
             )
@@ -1245,14 +1244,9 @@ def is_hdf5(path: Path) -> bool:
         return path.suffix in (".h5", ".hdf5") or file.read(8) == b"\x89HDF\r\n\x1a\n"
 
 
-def is_lerobot(path: Path) -> bool:
-    """Whether a folder is a dataset of LeRobot."""
-    return (path / "meta" / "info.json").is_file()
-
-
 def reader_of(path: Path) -> Callable[[Path, Options], Source]:
     """The function that reads a data set of its format."""
-    if is_lerobot(path):
+    if (path / "meta" / "info.json").is_file():
         return read_lerobot
     if is_hdf5(path):
         return read_hdf5
@@ -1275,12 +1269,9 @@ class Episode:
     clouds: list[np.ndarray | None] = field(default_factory=list)  # None: nothing was seen
     states: list[np.ndarray] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)
-    left_out: Counter = field(default_factory=Counter)  # what -> how many
-
-
-# What is left out of each point
-BESIDE_POSITION = "numbers beside x, y, z of each point (--color keeps colors)"
-BESIDE_COLOR = "numbers beside position and color of each point"
+    unseen_points: int = 0  # at NaN or at the origin; left out
+    extra_numbers: int = 0  # of each point, beside its position and color; left out
+    empty_clouds: int = 0  # in whose place stands the one before
 
 
 def assemble(
@@ -1301,6 +1292,8 @@ def assemble(
         if not incomplete:
             refuse(path, f"{problem}: download it again, or import what there is by --incomplete")
         notes.append(f"what is missing ({problem})")
+    if not episodes and options.skip:
+        refuse(path, "--skip leaves no episode of it")
     if not episodes:
         refuse(path, "holds no frames: record or download it again")
     if parts := len(episodes) - len({episode.number for episode in episodes}):
@@ -1404,8 +1397,8 @@ def wrong_totals(source: Source, lengths: Counter, skip: frozenset[int]) -> str 
 def add_frame(
     path: Path, episode: Episode, frame: Frame, options: Options, num_points: int
 ) -> None:
-    """Adds a frame to an episode: its numbers as they are, of its cloud the farthest points."""
-    index = len(episode.states)
+    """Appends state and action unchanged, and the cloud cleaned, cropped and sampled."""
+    index = len(episode.states) if frame.index is None else frame.index
     for name, value in (("state", frame.state), ("action", frame.action)):
         if not np.isfinite(value).all():
             refuse(
@@ -1416,17 +1409,15 @@ def add_frame(
     episode.states.append(np.float64(frame.state))
     episode.actions.append(np.float64(frame.action))
 
-    points = frame.cloud()  # (M, P)
+    points = frame.cloud  # (M, P)
     xyz = points[:, :3]
     seen = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
-    episode.left_out["points at NaN or at the origin"] += int((~seen).sum())
+    episode.unseen_points += int((~seen).sum())
     points = options.camera.place(points[seen])
     kept = 3 if options.color is None else 6
     if points.shape[1] < kept:
         refuse(path, f"its points have {points.shape[1]} numbers, so no color: leave --color out")
-    if extra := points.shape[1] - kept:
-        what = BESIDE_POSITION if options.color is None else BESIDE_COLOR
-        episode.left_out[what] = extra
+    episode.extra_numbers = points.shape[1] - kept
     if len(points) == 0:
         episode.clouds.append(None)
         return
@@ -1451,7 +1442,7 @@ def fill_empty(path: Path, episode: Episode) -> None:
     first_seen = next(cloud for cloud in clouds if cloud is not None)
     for i in empty:  # in their order, so that the cloud before is never empty
         clouds[i] = (clouds[i - 1] if i > 0 else first_seen).copy()
-    episode.left_out["empty clouds, in whose place stands the one before"] = len(empty)
+    episode.empty_clouds = len(empty)
 
 
 def scale_colors(path: Path, episodes: list[Episode]) -> None:
@@ -1605,10 +1596,7 @@ def to_recording(
         episode_ends=np.cumsum([len(episode.states) for episode in episodes]),
         meta=meta,
     )
-    try:
-        recording.check()
-    except RecordingError as error:
-        refuse(path, str(error))
+    check_file(path, recording)
     return recording
 
 
@@ -1617,24 +1605,19 @@ def describe(
 ) -> str:
     """The line about a file: what it holds, and what was left out."""
     shapes = [f"{part} {getattr(recording, part).shape}" for part in ("points", "state", "action")]
-    left_out = [f"{count} {what}" for what, count in total_left_out(episodes).items() if count]
-    left_out += notes
+    beside = "x, y, z of each point (--color keeps colors)"
+    if recording.points.shape[2] == 6:
+        beside = "position and color of each point"
+    counts = {
+        "points at NaN or at the origin": sum(e.unseen_points for e in episodes),
+        f"numbers beside {beside}": max(e.extra_numbers for e in episodes),
+        "empty clouds, in whose place stands the one before": sum(e.empty_clouds for e in episodes),
+    }
+    left_out = [f"{count} {what}" for what, count in counts.items() if count] + notes
     return (
         f"wrote {file}: {len(recording)} episodes of {recording.instruction!r}, "
         f"{', '.join(shapes)}; left out: {'; '.join(left_out) or 'nothing'}"
     )
-
-
-def total_left_out(episodes: list[Episode]) -> Counter:
-    """What was left out of a task: a sum, but for the numbers of each point."""
-    total: Counter = Counter()
-    for episode in episodes:
-        for what, count in episode.left_out.items():
-            if what in (BESIDE_POSITION, BESIDE_COLOR):
-                total[what] = max(total[what], count)
-            else:
-                total[what] += count
-    return total
 
 
 def print_suspicions(file: Path, recording: Demonstrations) -> int:
@@ -1656,8 +1639,8 @@ def check(path: Path) -> None:
 
 def show(path: str, out: str | None, episode: int) -> None:
     """Draws an episode of a recording."""
-    picture = Path(out) if out else Path(path).with_suffix(".png")
-    if picture.suffix != ".png":
+    picture = Path(out) if out else Path(path).parent / f"{Path(path).stem}.png"
+    if out and picture.suffix != ".png":
         raise UserError(f"--out is {out}: name a .png file")
     if out and not picture.parent.is_dir():
         raise UserError(f"--out is {out}: its folder does not exist")
@@ -1707,9 +1690,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    if args.import_:
+    if args.import_ is not None:
         import_recordings(args)
-    elif args.check:
+    elif args.check is not None:
         check(Path(args.check))
     else:
         show(args.show, args.out, args.episode)

@@ -1,9 +1,9 @@
 """Demonstrations: their files, what looks wrong in them, windows that are trained on, augmentation.
 
-Nothing here knows a simulator or a robot: simulator.py and robot.py record, and so may you. A file
-is checked when it is written and when it is read. `WindowSampler` holds a recording as tensors, and
-its `batch` draws what `DAMIPolicy.loss` takes beside the instruction and the noise. Nothing of the
-project is imported.
+This file knows no simulator and no robot: simulator.py, robot.py or a script of your own make the
+recordings. A file is checked when it is written and when it is read. `WindowSampler` holds a
+recording as tensors, and its `batch` draws what `DAMIPolicy.loss` takes beside the instruction and
+the noise. Nothing of the project is imported.
 
 Letters: W windows, T demonstration frames, F stored frames, N points, P numbers a point (x, y, z
 and features), E episodes, H horizon (16 by default), To observation steps (2), Ta executed actions
@@ -46,12 +46,13 @@ def positions(points: Any) -> Any:
 
 
 def farthest_point_sample(points: np.ndarray, n: int) -> np.ndarray:
-    """Samples n of the points (M, P) float32: the first one, then always the farthest from those.
+    """Samples n of the points (M, P) float32 so that they lie far from one another.
 
-    Distances are those of the positions; a point keeps its features. Returns (n, P) float32 in the
-    order of selection, so that the first k of the n are themselves such a sample of k. The same
-    cloud always gives the same sample. With M < n the sample is repeated from its beginning.
-    Raises ValueError for an empty cloud.
+    It starts with the first point, and then always adds the one that is farthest from all that were
+    chosen so far. Distances are those of the positions; a point keeps its features. Returns (n, P)
+    float32 in the order of selection, so that the first k of the n are themselves such a sample of
+    k. The same cloud always gives the same sample. With M < n the sample is repeated from its
+    beginning. Raises ValueError for an empty cloud.
     """
     if len(points) == 0:
         raise ValueError("the cloud is empty: nothing was seen inside the workspace")
@@ -102,7 +103,7 @@ class Demonstrations:
     meta: dict
 
     def __post_init__(self) -> None:
-        """Raises RecordingError for a field of another type, which no method could work with."""
+        """Raises RecordingError if a field has the wrong type; the methods rely on these types."""
         for name in ("task", "instruction"):
             value = getattr(self, name)
             if not isinstance(value, str):
@@ -115,7 +116,7 @@ class Demonstrations:
                 )
         if not isinstance(self.meta, dict):
             raise RecordingError(
-                f"meta must be a dict, not {type(self.meta).__name__}: {{}} says nothing"
+                f"meta must be a dict, not {type(self.meta).__name__}: write {{}} to say nothing"
             )
 
     def __len__(self) -> int:
@@ -285,8 +286,7 @@ class Demonstrations:
         near = meta.get("rotation_near_rad")
         if near is None or meta.get("positions_in_state") != 1:
             return
-        numbers = isinstance(near, list) and not {type(x) for x in near} - {int, float}
-        if not numbers or len(near) != 3 or not np.isfinite(near).all():
+        if not is_numbers(near, (3,)):
             raise RecordingError(f"rotation_near_rad is {near!r}: write three numbers, radians")
         if min(self.state.shape[1], self.action.shape[1]) < 6:
             raise RecordingError(
@@ -310,14 +310,17 @@ class Demonstrations:
             )
 
     def check_workspace(self, meta: dict) -> None:
-        if meta.get("workspace") is None:
-            return
-        try:
-            corners = np.array(meta["workspace"], np.float64)
-        except (TypeError, ValueError):  # no numbers, or lists of different lengths
-            corners = np.zeros(0)
-        if corners.shape != (2, 3) or not np.isfinite(corners).all():
+        if meta.get("workspace") is not None and not is_numbers(meta["workspace"], (2, 3)):
             raise RecordingError("workspace must be two corners of three numbers, metres")
+
+
+def is_numbers(value: Any, shape: tuple[int, ...]) -> bool:
+    """Whether a value from JSON is finite numbers of that shape, and no text or bool."""
+    numbers = np.array(value, dtype=object)
+    return numbers.shape == shape and all(
+        type(x) in (int, float) and abs(x) < 1e30
+        for x in numbers.flat  # False for NaN, too
+    )
 
 
 def meta_as_json(value: Any) -> str:
@@ -386,7 +389,7 @@ def save_demonstrations(path: str | Path, demonstrations: Demonstrations) -> Non
 
     def write(temporary: Path) -> None:
         with open(temporary, "wb") as file:
-            np.savez(  # compressed it would take half the size and six times the loading time
+            np.savez(  # savez_compressed would halve the file, which would load six times as slowly
                 file,
                 task=demonstrations.task,
                 instruction=demonstrations.instruction,
@@ -408,6 +411,8 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     inconsistent, or that may not be read.
     """
     path = Path(path)
+    if path.is_dir():
+        raise RecordingError(f"{path} is a folder: name one of the .npz files in it")
     if not path.is_file():
         raise RecordingError(
             f"{path} is missing: collect it with `python simulator.py`, or record it"
@@ -428,19 +433,24 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     if missing := [name for name in FIELDS if name not in arrays]:
         raise RecordingError(f"{path} is no file of demonstrations: it lacks {', '.join(missing)}")
 
-    meta = read_json(path, "meta", arrays["meta"])
-    if not isinstance(meta, dict):
-        raise RecordingError(f"{path}: meta must be a dict, not {type(meta).__name__}")
-    demonstrations = Demonstrations(
-        task=read_text(path, "task", arrays["task"]),
-        instruction=read_text(path, "instruction", arrays["instruction"]),
-        points=arrays["points"],
-        state=arrays["state"],
-        action=arrays["action"],
-        episode_ends=arrays["episode_ends"],
-        meta=meta,
+    task, instruction, meta = (
+        read_text(path, name, arrays[name]) for name in ("task", "instruction", "meta")
     )
-    check_file(path, demonstrations)
+    try:
+        demonstrations = Demonstrations(
+            task=task,
+            instruction=instruction,
+            points=arrays["points"],
+            state=arrays["state"],
+            action=arrays["action"],
+            episode_ends=arrays["episode_ends"],
+            meta=json.loads(meta),
+        )
+        demonstrations.check()
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise RecordingError(f"{path}: meta is no JSON: {error}") from None
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
     return demonstrations
 
 
@@ -459,17 +469,9 @@ def read_text(path: Path, name: str, array: np.ndarray) -> str:
     return array.item()
 
 
-def read_json(path: Path, name: str, array: np.ndarray) -> Any:
-    """The value that an array of a file holds as JSON text; RecordingError if it does not."""
-    try:
-        return json.loads(read_text(path, name, array))
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise RecordingError(f"{path}: {name} is no JSON: {error}") from None
-
-
 # ---- Suspicions ----------------------------------------------------------------------------------
 
-SPREADS = 20  # a number that lies so many times the usual spread outside of it is an outlier
+SPREADS = 20  # an outlier lies more than this many times the usual range outside of that range
 SCENE = (0.05, 10.0)  # metres: the diagonal of what a manipulator works on
 LAGS = range(-2, 3)  # frames by which actions may be shifted
 
@@ -539,28 +541,23 @@ def suspect_scale(demonstrations: Demonstrations) -> list[str]:
 def suspect_shifted_actions(demonstrations: Demonstrations) -> list[str]:
     """Actions that go with the state's change at another frame better than at their own.
 
-    An action may be a velocity or a displacement, or else a target position, whose own change from
-    the frame before is then what counts. Both are compared with the change of the state that
-    follows. Nothing moves before it is told to, so a negative lag is a mistake. A positive one may
-    be that of the controller, which spreads over several frames: only one that is nearly perfect is
-    suspected.
+    An action may be a velocity or a displacement; where it is a target position, its own change
+    from the frame before is compared instead. Either is compared with the change of the state that
+    follows it. A negative lag is a mistake, since nothing moves before its action. A positive one
+    may come from the controller, which spreads an action over several frames, so it is reported
+    only if the fit is nearly perfect.
     """
-    margin = max(LAGS)
-    actions, changes = [], {lag: [] for lag in LAGS}
     dims = min(demonstrations.state.shape[1], demonstrations.action.shape[1])
-    for index in range(len(demonstrations)):
-        frames = demonstrations.episode(index)
-        action = demonstrations.action[frames, :dims].astype(np.float64)  # (T, D)
-        change = np.diff(demonstrations.state[frames, :dims].astype(np.float64), axis=0)
-        inner = np.arange(margin, len(change) - margin)
-        actions.append(np.stack([action[inner], action[inner] - action[inner - 1]]))  # (2, t, D)
-        for lag in LAGS:
-            changes[lag].append(change[inner + lag])  # (t, D)
-    acted = np.concatenate(actions, axis=1)
-    if acted.shape[1] < 8:
+    action = demonstrations.action[:, :dims].astype(np.float64)  # (F, D)
+    change = np.diff(demonstrations.state[:, :dims].astype(np.float64), axis=0)  # (F - 1, D)
+    margin = max(LAGS)  # to both ends of an episode, so that no lag leaves it
+    episodes = [demonstrations.episode(index) for index in range(len(demonstrations))]
+    inner = np.concatenate([np.arange(e.start + margin, e.stop - 1 - margin) for e in episodes])
+    if len(inner) < 8:
         return []
 
-    curves = np.stack([correlation(acted, np.concatenate(changes[lag])) for lag in LAGS])
+    acted = np.stack([action[inner], action[inner] - action[inner - 1]])  # (2, t, D)
+    curves = np.stack([correlation(acted, change[inner + lag]) for lag in LAGS])  # (lags, 2, D)
     kind = curves.max(axis=0).argmax(axis=0)  # (D,) 0: the action, 1: its change
     curves = curves[:, kind, np.arange(dims)]  # (lags, D)
     related = curves.max(axis=0) > 0.9
@@ -576,8 +573,8 @@ def suspect_shifted_actions(demonstrations: Demonstrations) -> list[str]:
     when = "earlier" if lag < 0 else "later"
     return [
         f"actions go best with the change of the state {frames} {when} "
-        f"(correlation {curve[best]:.3f}, with the "
-        f"change that follows them {curve[own]:.3f}): an action is what is done after its frame"
+        f"(correlation {curve[best]:.3f}), and less well with the change right after them "
+        f"({curve[own]:.3f}): store with each frame the action that is done after it"
     ]
 
 
@@ -713,16 +710,17 @@ class WindowSampler:
         demonstrations: of one task.
         config: a `model.PolicyConfig`, or anything with its dimensions.
         device: where the tensors are held.
-        after_success: a window that begins more than so many frames after its episode's first
-            success, if the recording says when that was, is a late one. None: no window is.
-        late_fraction: the share of late windows among those that are drawn. They show how to stay
-            where the task is done; but they are nearly all alike, and a few are enough. 0: there
-            are none.
+        after_success: windows that begin more than this many frames after their episode's first
+            success are late. With None, or in a recording without `success_frames`, none is late.
+        late_fraction: the share of late windows among those that are drawn. They teach a policy to
+            stay where the task is done, and are so much alike that a few are enough. With 0 they
+            are left out.
         augment: `batch` moves each scene by an affine map of its own, where the recording says
             which numbers of a state are positions. Rotations turn along where it says which they
             are (`rotation_near_rad`); other directions in the state or the action stay as they are.
-        one_map: all scenes of a batch, its demonstration included, are moved by one map. Where a
-            task is a place that only its demonstrations show, maps of their own would hide it.
+        one_map: all scenes of a batch, its demonstration included, are moved by one map. That is
+            for tasks whose goal only the demonstration shows: with maps of their own, windows would
+            have another goal than the demonstration.
 
     Raises RecordingError for demonstrations that do not fit the policy: dimensions, points, length.
     """
@@ -765,21 +763,20 @@ class WindowSampler:
         self.max_displacement = max(1.0, largest)  # moved actions are clipped to this
 
         success_frames = demonstrations.meta.get("success_frames")
-        windows, late = [], []  # of each episode
-        for index, episode in enumerate(self.episodes):
-            of_episode = self.windows_of(episode)  # (windows, H)
-            is_late = torch.zeros(len(of_episode), dtype=torch.bool)
-            if after_success is not None and success_frames is not None:
-                last_early_start = episode.start + success_frames[index] + after_success
-                is_late = of_episode[:, 0] > last_early_start
-            if late_fraction == 0:
-                of_episode, is_late = of_episode[~is_late], is_late[~is_late]
-            windows.append(of_episode)
-            late.append(is_late)
-        counts = torch.tensor([len(frames) for frames in windows])
-        self.windows = torch.cat(windows).to(device)  # (W, H) the frame of each action
-        self.episode_of = torch.arange(len(windows)).repeat_interleave(counts)  # (W,)
-        self.late = torch.cat(late)  # (W,) bool
+        windows_of_episodes = [self.windows_of(episode) for episode in self.episodes]
+        windows = torch.cat(windows_of_episodes)  # (W, H) the frame of each action
+        counts = torch.tensor([len(of_episode) for of_episode in windows_of_episodes])
+        episode_of = torch.arange(len(counts)).repeat_interleave(counts)  # (W,)
+        late = torch.zeros(len(windows), dtype=torch.bool)
+        if after_success is not None and success_frames is not None:
+            starts = torch.tensor([episode.start for episode in self.episodes])
+            last_early_start = starts + torch.tensor(success_frames) + after_success  # (E,)
+            late = windows[:, 0] > last_early_start[episode_of]
+        if late_fraction == 0:
+            windows, episode_of, late = windows[~late], episode_of[~late], late[~late]
+        self.windows = windows.to(device)
+        self.episode_of = episode_of
+        self.late = late
         self.late_fraction = late_fraction
 
     def check_dimensions(self, demonstrations: Demonstrations) -> None:
@@ -879,7 +876,8 @@ class WindowSampler:
         """Draws a reference demonstration, and n windows of other episodes if there are any.
 
         With three or more episodes, the first `support` windows also come from other episodes than
-        the rest. Otherwise an inner step could lower the loss of the rest by memory.
+        the rest. Otherwise the inner step could lower the loss of the rest by remembering episodes
+        that both share.
         """
         reference = self.sample_episode(generator)
         demo = self.demonstration(reference)

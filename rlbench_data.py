@@ -329,7 +329,9 @@ def is_data_set(path: Path) -> bool:
 def episode_paths(path: Path) -> Iterator[Path]:
     """The folders of the episodes in a variation, a task or a whole data set."""
     for episodes in ("episodes", "*/episodes", "*/*/episodes"):
-        yield from (folder for folder in path.glob(f"{episodes}/episode*") if folder.is_dir())
+        for folder in path.glob(f"{episodes}/episode*"):
+            if folder.is_dir() and re.fullmatch(r"episode\d+", folder.name):
+                yield folder
 
 
 def variation_folder_of(folder: Path) -> Path:

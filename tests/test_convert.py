@@ -46,6 +46,8 @@ def test_show_draws_a_picture_of_an_episode_that_there_is(capsys):
     assert "reach.npz: holds episodes 0 to 1, not 2" in message
     message = fails(convert, ["--show", "reach.npz", "--out", "reach.v2"], capsys)
     assert "--out is reach.v2: name a .png file" in message
+    assert ". is a folder: name one of the" in fails(convert, ["--show", "."], capsys)
+    assert "neither zarr, HDF5" in fails(convert, ["--import", ""], capsys)  # an unset variable
     message = fails(convert, ["--show", "nothing.npz", "--out", "nowhere/reach.png"], capsys)
     assert "--out is nowhere/reach.png: its folder does not exist" in message
 
@@ -181,6 +183,10 @@ FAR = 90 + RNG.uniform(0, 0.1, (20, 30, 3))
         ({"data__point_cloud": FAR}, SAY, "90.1 m from the origin, but span 0.0999 m"),
         ({"data__state": np.full((20, 7), np.nan)}, SAY, "state of episode 0 holds NaN"),
         ({"data__state": np.full(20, "x")}, SAY, "data/state must be plain numbers"),
+        ({"data__state": np.array(3.0)}, SAY, "data/state must be plain numbers"),
+        ({}, [*SAY, "--skip", "0", "1"], "stir.zarr: --skip leaves no episode of it"),
+        ({}, [*SAY, "--feature", "data/wrist"], "DP3, for which --feature has no meaning"),
+        ({}, [*SAY, "--state", "data/state"], "for which --state has no meaning: leave it out"),
         ({"data__action": np.zeros((19, 4))}, SAY, "lengths differ"),
         ({"meta__episode_ends": np.array([8, 21])}, SAY, "lengths differ"),
         ({"meta__episode_ends": np.array([8.0, 20.0])}, SAY, "growing whole numbers"),
@@ -256,7 +262,7 @@ def test_what_is_no_color_is_not_kept_as_one(cloud, message, capsys):
 def test_a_name_of_a_color_that_is_not_read_is_refused(capsys):
     buffer("stir.zarr", data__point_cloud=RNG.uniform(0, 1, (20, 30, 6)).astype(np.float32))
     message = fails(convert, ["--import", "stir.zarr", *SAY, "--color", "data/img"], capsys)
-    assert "write --color alone if they have six numbers, or leave it out" in message
+    assert "write --color alone if the points have six numbers, or leave it out" in message
 
 
 def test_an_episode_can_be_left_out(capsys):
@@ -567,6 +573,9 @@ DATA, TASKS = "kitchen/data/chunk-000/file-000.parquet", "kitchen/meta/tasks.par
         (lambda: None, "--feature observation.images.top", "observation.images.top (video)"),
         (lambda: edit(codebase_version=lambda _: "v1.6"), "", "format v1.6: convert it to v3.0"),
         (write("kitchen/meta/info.json", b"{"), "", "is no JSON object"),
+        (write("kitchen/meta/info.json", b"[]"), "", "is no JSON object, but list"),
+        (write("kitchen/meta/info.json", b"[" * 100_000), "", "is no JSON object"),
+        (lambda: None, "--state action", "a dataset of LeRobot, for which --state has no meaning"),
         (lambda: shutil.rmtree("kitchen/data"), "", "of 3 episodes 3 are missing (0, 1, 2)"),
         (lambda: None, "--feature observation.state", "observation.state is neither"),
         (lambda: None, "--task stir", "holds 2 tasks"),
@@ -714,6 +723,8 @@ def test_files_are_read_in_the_order_of_their_numbers():
         ({"intrinsics": [-50.0, *LENS[1:]]}, "intrinsics: two focal lengths in pixels"),
         ({"depth_scale": -1}, "depth_scale: metres a unit of depth, such as 0.001"),
         ({"depth_scale": True}, "depth_scale: give 1 finite numbers"),
+        ({"depth_scale": 10**400}, "depth_scale: give 1 finite numbers"),
+        ([], "is no JSON object, but list"),
     ],
 )
 def test_a_wrong_camera_is_refused_in_one_line(camera, message, capsys):
@@ -992,6 +1003,20 @@ def test_depth_and_color_of_pictures_become_colored_points(capsys):
     np.testing.assert_allclose(found[2, 5], expected, rtol=2e-3)
 
 
+def test_a_picture_with_a_damaged_chunk_is_refused_in_one_line(capsys):
+    depth = RNG.integers(1, 60_000, (20, 300, 300), np.uint16)  # so large that it has many chunks
+    pictures = [encoded(image, "PNG") for image in depth]
+    chunks = [place for place in range(len(pictures[0])) if pictures[0].startswith(b"IDAT", place)]
+    assert len(chunks) > 1
+    damaged = bytearray(pictures[0])
+    damaged[chunks[1]] ^= 0xFF
+    info = {"is_depth_map": True, "depth_unit": "mm"}
+    dataset("kitchen", seen=DEPTH, info=info, **{DEPTH: [bytes(damaged), *pictures[1:]]})
+    Path("camera.json").write_text(json.dumps({"intrinsics": LENS}))
+    message = fails(convert, "--import kitchen --camera camera.json".split(), capsys)
+    assert "file-000.parquet: is damaged or holds no images: broken PNG file" in message
+
+
 # ---- HDF5 ----------------------------------------------------------------------------------------
 
 
@@ -1097,6 +1122,17 @@ def maniskill(path, seen):
             group[f"obs/{name}"] = np.repeat(np.asarray(value)[None], T + 1, axis=0)
     lengths = {"episodes": [{"episode_id": 0, "elapsed_steps": T}]}
     Path(path).with_suffix(".json").write_text(json.dumps(lengths))
+
+
+@pytest.mark.parametrize("said", [{"episodes": None}, {"episodes": 3}, {"episodes": [1]}, {}])
+def test_what_the_json_beside_a_file_does_not_say_is_not_compared(said):
+    depth = one_pixel(700, np.int16)[0][..., None]
+    parameters = {"intrinsic_cv": np.float32(MATRIX)}
+    seen = {f"sensor_param/front/{name}": value for name, value in parameters.items()}
+    maniskill("demo.h5", {"sensor_data/front/depth": depth} | seen)
+    Path("demo.json").write_text(json.dumps(said))
+    convert.main(["--import", "demo.h5", *SAY, "--depth-unit", "mm"])
+    assert len(load_demonstrations("recordings/stir-the-soup.npz")) == 1
 
 
 def test_depth_of_maniskill_is_seen_by_its_own_camera():

@@ -371,7 +371,15 @@ BAD_PARTS = [
     ({"task": "re\0ach"}, "is no name"),
     *(
         (meta(workspace=wrong), "workspace must be two corners")
-        for wrong in ("x", [[0, 0, 0], [1, 1]], [[0, 0, None], [1, 1, 1]], [[0, 0, "x"], [1, 1, 1]])
+        for wrong in (
+            "x",
+            [[0, 0, 0], [1, 1]],
+            [[0, 0, None], [1, 1, 1]],
+            [[0, 0, "x"], [1, 1, 1]],
+            [["0", "0", "0"], ["1", "1", "1"]],
+            [[False, False, False], [True, True, True]],
+            [[0, 0, 0], [1, 1, 10**400]],
+        )
     ),
     ({"state": np.array([None, 1], dtype=object)}, "is damaged or no .*: Object arrays"),
     ({"meta": "not json"}, "meta is no JSON: Expecting"),
@@ -786,7 +794,7 @@ def test_without_a_stretch_rotations_turn_as_the_points_do(monkeypatch):
 def test_rotations_that_are_not_there_are_refused():
     sound = arm_recording()
     sound.check()
-    for near in ([0, 1], [0, "1", 0], [0, float("inf"), 0], 3.0):
+    for near in ([0, 1], [0, "1", 0], [0, float("inf"), 0], [10**400, 0, 0], 3.0):
         with pytest.raises(RecordingError, match="rotation_near_rad is"):
             replace(sound, meta={**sound.meta, "rotation_near_rad": near}).check()
     with pytest.raises(RecordingError, match="not have 7 and 4 numbers"):

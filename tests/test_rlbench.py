@@ -5,6 +5,7 @@ RLBench is not installed here. rlbench_standin.py has its interface and writes f
 
 import os
 import pickle
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -165,7 +166,11 @@ def test_what_the_import_says_of_a_recording_is_what_augmentation_and_suite_need
 @pytest.mark.parametrize("folder", ["rlbench", "rlbench/close_box", "rlbench/close_box/variation0"])
 def test_a_data_set_a_task_or_a_variation_can_be_named(folder):
     standin.write_task("rlbench/close_box")
-    assert list(imported(folder)) == ["close_box"]
+    episodes = Path("rlbench/close_box/variation0/episodes")
+    number = len(list(episodes.iterdir()))
+    shutil.copytree(episodes / "episode0", episodes / "episode0_backup")  # is no episode
+    recordings = imported(folder)
+    assert list(recordings) == ["close_box"] and len(recordings["close_box"]) == number
 
 
 def test_each_task_and_variation_has_a_recording_of_its_own():
