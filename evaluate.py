@@ -6,8 +6,8 @@
     python evaluate.py --without instruction --swap demonstration    # is the demonstration read?
 
 An episode is played to its end, and its success is reported twice: at any step, as the paper and
-DP3 count it, and at the end, as Meta-World's own evaluation does. Each rollout holds one reference
-demonstration, drawn from the task's own. Episodes come from seeds that no demonstration uses,
+DP3 count it, and at the end, as Meta-World's own evaluation does. Each rollout reads one reference
+demonstration, drawn from those of its task. Episodes come from seeds that no demonstration uses,
 unless --known-goals is given. With --inner-steps a policy is adapted to each task as in training;
 Algorithm 2 of the paper is in finetune.py.
 
@@ -24,11 +24,11 @@ import copy
 import json
 import math
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -43,21 +43,17 @@ import maml
 import model
 from clip import TextWeightsError, text_features
 from common import UserError, WorkerPool, progress_bar, report_progress, run_jobs
-from data import (
-    Demonstrations,
-    RecordingError,
-    WindowSampler,
-    load_demonstrations,
-    positions,
-    write_atomically,
-)
+from data import Demonstrations, RecordingError, WindowSampler, load_demonstrations, positions
 from model import CheckpointError, DAMIPolicy
 from report import (
+    Frame,
     Outcomes,
     Parts,
     Successes,
+    animate,
     mean_interval,
     mean_success,
+    movie_writer,
     paper_columns,
     write_report,
 )
@@ -74,21 +70,21 @@ from simulator import (
 )
 
 EVALUATION_SEED = 0  # of the goals; the same for every seed of training
-EPISODES_A_JOB = 10  # side by side in one process; with another number other noise is drawn
+EPISODES_A_JOB = 10  # rolled out side by side in one process; another number draws other noise
 
 # ---- What may be read in place of a demonstration ------------------------------------------------
 #
 # Each takes a demonstration, as `WindowSampler.demonstration` gives it, and returns one of the same
-# shapes. What a policy loses by one of them tells what it reads.
+# shapes. The success that a policy loses by one of them shows how much it reads what was left out.
 
 
 def zeros(demonstration: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Nothing of a demonstration."""
+    """Zeros in place of everything."""
     return {name: torch.zeros_like(x) for name, x in demonstration.items()}
 
 
 def last_frame(demonstration: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The last frame in the place of each: how it ends, but not how it comes to that."""
+    """The last frame in place of every frame: how it ends, but not the way there."""
     return {name: x[:, -1:].expand_as(x) for name, x in demonstration.items()}
 
 
@@ -111,6 +107,121 @@ DEMONSTRATION_CONTROLS = {
     "shuffled": shuffled_frames,
 }
 
+
+def controlled(demonstration: dict[str, Tensor], control: str | None) -> dict[str, Tensor]:
+    """What a policy reads in place of a demonstration.
+
+    `control` is a key of DEMONSTRATION_CONTROLS; None leaves the demonstration as it is.
+    """
+    return demonstration if control is None else DEMONSTRATION_CONTROLS[control](demonstration)
+
+
+def of_next_task(inputs: dict[str, Any]) -> dict[str, Any]:
+    """Gives every task what belongs to the next one, and the last what belongs to the first."""
+    values = list(inputs.values())
+    return dict(zip(inputs, [*values[1:], values[0]]))
+
+
+# ---- Checkpoints, and what they say --------------------------------------------------------------
+
+SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
+# What train.py saves in a checkpoint beside the weights
+TRAINED = ("suite", "preset", "arguments", "text_weights", "step")
+
+
+def checkpoints_of(path: str | Path) -> list[Path]:
+    """The checkpoints of a run's folder in the order of steps, or its adapted.pt; a file as it is.
+
+    Raises UserError for a folder without checkpoints.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    # By the length first, since steps may have more than five digits
+    by_step = sorted(path.glob("ema-*.pt"), key=lambda file: (len(file.name), file.name))
+    if by_step:
+        return by_step
+    if (path / "adapted.pt").exists():
+        return [path / "adapted.pt"]
+    if (path / "last.pt").is_file():
+        raise UserError(
+            f"{path} is a run that was interrupted before its first checkpoint: add --resume to "
+            f"its training, or name {path / 'last.pt'}"
+        )
+    adapted = ", ".join(str(file.parent) for file in sorted(path.glob("*/adapted.pt")))
+    suggestion = adapted or "a folder of train.py or finetune.py, or a .pt file"
+    raise UserError(f"{path} holds no checkpoint: name {suggestion}")
+
+
+def default_checkpoint(suite: str) -> Path:
+    """The last checkpoint of the newest finished run on `suite`; without any, one that ships.
+
+    Runs of `tiny` do not count: they show that everything works, and succeed nearly nowhere.
+    Raises UserError where there is neither.
+    """
+    finished, tiny = [], []
+    for config in Path("runs").glob("*/config.json"):
+        with suppress(OSError, ValueError, KeyError, TypeError):  # of a damaged file
+            arguments = json.loads(config.read_text())["arguments"]
+            last = config.parent / f"ema-{arguments['steps']:05d}.pt"
+            if arguments["suite"] == suite and last.is_file():
+                runs_of_preset = tiny if arguments["preset"] == "tiny" else finished
+                runs_of_preset.append(last)
+    if finished:
+        return max(finished, key=lambda path: path.stat().st_mtime)
+    shipped = SHIPPED_CHECKPOINT.with_name(f"{suite}-small.pt")
+    if shipped.is_file():
+        print(
+            f"no finished run on {suite} in runs/: using the policy that comes with the code",
+            flush=True,
+        )
+        return shipped
+    if tiny:
+        run = max(tiny, key=lambda path: path.stat().st_mtime).parent
+        raise UserError(
+            f"{run} is a run of `tiny`, which only shows that everything works, and is never "
+            f"taken unasked: train with --preset small, or add --checkpoint {run}"
+        )
+    raise UserError(f"no finished run on {suite} in runs/: train one, or name a --checkpoint")
+
+
+def load_trained(
+    path: str | Path, device: str | torch.device = "cpu", **config_overrides: Any
+) -> tuple[DAMIPolicy, dict[str, Any]]:
+    """`model.load` of a file of train.py or finetune.py; CheckpointError for any other policy."""
+    return model.load(path, device, needs=TRAINED, **config_overrides)
+
+
+def reads_instruction(info: dict[str, Any]) -> bool:
+    """Whether a checkpoint's policy is given its instruction. It is, unless adapted without."""
+    return info.get("adaptation", {}).get("instruction", True)
+
+
+def instruction_features(
+    instructions: dict[str, str],
+    weights: str | None,
+    identity: str | None,
+    device: str | torch.device,
+    use_instruction: bool = True,
+) -> tuple[dict[str, Tensor], str]:
+    """Encodes instructions with CLIP's text tower.
+
+    Args:
+        instructions: task -> sentence.
+        weights: those of --clip-weights, see `clip.text_features`.
+        identity: of the weights that must be used, as a checkpoint names them; None: any.
+        device: of the features.
+        use_instruction: False gives zeros in place of every feature.
+
+    Returns:
+        Task -> feature (text_dim,), and the identity of the weights.
+    """
+    features, identity = text_features(list(instructions.values()), weights, identity)
+    if not use_instruction:
+        features = torch.zeros_like(features)
+    return dict(zip(instructions, features.to(device))), identity
+
+
 # ---- The inner step, as adaptation ---------------------------------------------------------------
 
 
@@ -119,7 +230,7 @@ def rate_of_checkpoint(
 ) -> maml.InnerRate:
     """The learning rate of an inner step: `override`, or that of the checkpoint's training.
 
-    The training has one number, or learned one for each tensor.
+    Training used one rate for all weights, or learned one for each tensor.
     """
     if override is not None:
         return override
@@ -155,8 +266,7 @@ def take_inner_steps(
         batch: windows in the batch.
         lr: the learning rate, or parameter name -> tensor, see `maml.adapt`.
         seed: of the batch: its demonstration, its windows and their noise.
-        demonstration_control: what the policy reads in place of the batch's demonstration, a key of
-            DEMONSTRATION_CONTROLS; None: the demonstration.
+        demonstration_control: of the batch's demonstration, see `controlled`.
 
     Yields:
         (steps done, loss of the batch after them, the adapted policy) after each step. The policy
@@ -172,9 +282,8 @@ def take_inner_steps(
         **sampler.batch(batch, generator),
         **adapted.draw_noise_and_timesteps(batch, generator),
     }
-    if demonstration_control is not None:
-        demonstration = {name: x for name, x in support.items() if name.startswith("demo_")}
-        support.update(DEMONSTRATION_CONTROLS[demonstration_control](demonstration))
+    demonstration = {name: x for name, x in support.items() if name.startswith("demo_")}
+    support.update(controlled(demonstration, demonstration_control))
     support = {name: x.to(text.device) for name, x in support.items()}
 
     loss_fn = partial(model.loss_of, policy)
@@ -188,13 +297,14 @@ def take_inner_steps(
                 f"{sampler.task}: the loss is not finite after inner step {step}: use a smaller "
                 "--inner-lr"
             )
-        adapted.load_state_dict(params, strict=False)  # the normalizer is none of the parameters
+        adapted.load_state_dict(params, strict=False)  # `params` lacks the normalizer
         yield step, loss.item(), adapted
 
 
 # ---- Rollouts ------------------------------------------------------------------------------------
 
 
+@torch.no_grad()
 def rollout(
     policy: DAMIPolicy,
     environments: Sequence[Environment],
@@ -209,8 +319,8 @@ def rollout(
 ) -> list[list[bool]]:
     """Rolls out E episodes of one task side by side, and says which of their steps were a success.
 
-    The demonstrations are encoded once. The policy reads To frames in every Ta: the others are not
-    observed, since observing takes most of a simulator's time.
+    The demonstrations are encoded once. Of every Ta frames the policy reads the last To. Only those
+    are observed, since observing takes most of a simulator's time.
 
     Args:
         policy: in evaluation mode.
@@ -218,8 +328,7 @@ def rollout(
         sampler: of the task's demonstrations, from which one is drawn for each rollout.
         text: instruction feature, (text_dim,).
         generator: draws demonstrations and noise; on the CPU.
-        demonstration_control: what the policy reads in place of its demonstration, a key of
-            DEMONSTRATION_CONTROLS; None: the demonstration.
+        demonstration_control: see `controlled`.
         reference: the demonstration that all rollouts hold; None: each draws its own.
         stop_at_success: an episode ends at its first success, and not when it is over.
         on_steps: called with the number of steps that the episodes took since its last call.
@@ -230,30 +339,35 @@ def rollout(
     To = policy.config.n_obs_steps
     device = text.device
 
-    # Each rollout holds one reference demonstration. All are drawn before any noise is, and they
+    # Each rollout reads one reference demonstration. All are drawn before any noise is, and they
     # are encoded one at a time, since they may differ in length.
-    contexts = []
     if reference is None:
         references = [sampler.sample_episode(generator) for _ in environments]
     else:
         references = [reference for _ in environments]
-    for demonstration in map(sampler.demonstration, references):
-        if demonstration_control is not None:
-            demonstration = DEMONSTRATION_CONTROLS[demonstration_control](demonstration)
-        with torch.no_grad():
-            contexts.append(policy.encode_demo(text[None], **demonstration))
+    contexts = []
+    for episode in references:
+        demonstration = controlled(sampler.demonstration(episode), demonstration_control)
+        contexts.append(policy.encode_demo(text[None], **demonstration))
 
-    # Of each episode the last To observations, the oldest first; at first the only one, To times.
-    observations = []
+    # The last To observations of each episode, the oldest first. At its start all are the same.
+    histories = []
     for environment, seed in zip(environments, seeds):
         environment.begin(seed)
-        observations.append([environment.observe()] * To)
+        try:
+            first = environment.observe()
+        except OutOfSightError as error:
+            raise UserError(
+                f"{sampler.task}: nothing is seen at the start of the episode of seed {seed}: "
+                f"look at the simulator's camera ({error})"
+            ) from error
+        histories.append(deque([first] * To, maxlen=To))
 
     successes: list[list[bool]] = [[] for _ in environments]
     running = list(range(len(environments)))
     while running:
-        points = np.stack([[o["point_cloud"] for o in observations[e]] for e in running])
-        state = np.stack([[o["agent_pos"] for o in observations[e]] for e in running])
+        points = np.stack([[o["point_cloud"] for o in histories[e]] for e in running])
+        state = np.stack([[o["agent_pos"] for o in histories[e]] for e in running])
         chunks = sample_chunks(
             policy,
             points=torch.from_numpy(points).to(device),  # (E, To, N, P)
@@ -262,18 +376,19 @@ def rollout(
             generator=generator,
         )  # (E, Ta, A)
 
-        taken = 0
-        for e, chunk in zip(list(running), chunks):
-            seen, of_steps, ended = take_actions(
-                environments[e], chunk, n_observations=To, stop_at_success=stop_at_success
+        steps_taken = 0
+        still_running = []
+        for e, chunk in zip(running, chunks):
+            step_successes, ended = take_actions(
+                environments[e], chunk, histories[e], stop_at_success
             )
-            observations[e] = [*observations[e], *seen][-To:]
-            successes[e] += of_steps
-            taken += len(of_steps)
-            if ended:
-                running.remove(e)
+            successes[e] += step_successes
+            steps_taken += len(step_successes)
+            if not ended:
+                still_running.append(e)
+        running = still_running
         if on_steps is not None:
-            on_steps(taken)
+            on_steps(steps_taken)
     return successes
 
 
@@ -286,140 +401,43 @@ def sample_chunks(
 ) -> np.ndarray:
     """Draws action chunks (E, Ta, A) for observations (E, To, N, P), (E, To, S) and E contexts."""
     if contexts[0] is None:  # this architecture reads no task
-        return policy.sample_actions(points, state, None, generator).cpu().numpy()
-
-    shapes = {context[0].shape for context in contexts}
-    if len(shapes) == 1:
-        stacked = tuple(torch.cat(parts) for parts in zip(*contexts))
-        return policy.sample_actions(points, state, stacked, generator).cpu().numpy()
-
-    chunks = [  # demonstrations of different lengths cannot be stacked
-        policy.sample_actions(points[[e]], state[[e]], context, generator)
-        for e, context in enumerate(contexts)
-    ]
-    return torch.cat(chunks).cpu().numpy()
+        chunks = policy.sample_actions(points, state, None, generator)
+    elif len({context[0].shape for context in contexts}) == 1:
+        stacked = tuple(torch.cat(tensors) for tensors in zip(*contexts))
+        chunks = policy.sample_actions(points, state, stacked, generator)
+    else:  # demonstrations of different lengths cannot be stacked
+        chunks_of_one = [
+            policy.sample_actions(points[[e]], state[[e]], context, generator)
+            for e, context in enumerate(contexts)
+        ]
+        chunks = torch.cat(chunks_of_one)
+    return chunks.cpu().numpy()
 
 
 def take_actions(
-    environment: Environment, chunk: np.ndarray, n_observations: int, stop_at_success: bool
-) -> tuple[list[dict[str, np.ndarray]], list[bool], bool]:
-    """Takes the actions of a chunk (Ta, A), up to the end of the episode.
+    environment: Environment,
+    chunk: np.ndarray,
+    history: deque[dict[str, np.ndarray]],
+    stop_at_success: bool,
+) -> tuple[list[bool], bool]:
+    """Takes the actions of a chunk (Ta, A); `history` is given what is seen after the last To.
 
-    Returns the observations after the last `n_observations` actions (fewer if the chunk is shorter,
-    or the episode ends before), whether each step reported success, and whether the episode ended.
-    It also ends, without success, where there is nothing to observe.
+    Returns whether each step reported success, and whether the episode ended. An episode in which
+    nothing is left to observe ends there, and its last step counts as no success.
     """
-    seen, successes = [], []
+    successes = []
     for i, action in enumerate(chunk):
         _, truncated, info = environment.advance(action)
         successes.append(bool(info["success"]))
         if truncated or (stop_at_success and info["success"]):
-            return seen, successes, True
-        if i >= len(chunk) - n_observations:
+            return successes, True
+        if i >= len(chunk) - history.maxlen:
             try:
-                seen.append(environment.observe())
+                history.append(environment.observe())
             except OutOfSightError:
-                return seen, [*successes[:-1], False], True
-    return seen, successes, False
-
-
-# ---- Checkpoints, and what they say --------------------------------------------------------------
-
-SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
-# What train.py saves in a checkpoint beside the weights
-TRAINED = ("suite", "preset", "arguments", "text_weights", "step")
-
-
-def checkpoints_of(path: str | Path) -> list[Path]:
-    """The checkpoints of a run's folder in the order of steps, or its adapted.pt; a file as it is.
-
-    Raises UserError for a folder without checkpoints.
-    """
-    path = Path(path)
-    if not path.is_dir():
-        return [path]
-    # By the length first, since steps may have more than five digits
-    by_step = sorted(path.glob("ema-*.pt"), key=lambda file: (len(file.name), file.name))
-    found = by_step or list(path.glob("adapted.pt"))
-    if not found and (path / "last.pt").is_file():
-        raise UserError(
-            f"{path} is a run that was interrupted before its first checkpoint: add --resume to "
-            f"its training, or name {path / 'last.pt'}"
-        )
-    if not found:
-        adapted = ", ".join(str(file.parent) for file in sorted(path.glob("*/adapted.pt")))
-        suggestion = adapted or "a folder of train.py or finetune.py, or a .pt file"
-        raise UserError(f"{path} holds no checkpoint: name {suggestion}")
-    return found
-
-
-def default_checkpoint(suite: str) -> Path:
-    """The last checkpoint of the newest finished run on `suite`; without any, one that ships.
-
-    Runs of `tiny` do not count: they show that everything works, and succeed nearly nowhere.
-    Raises UserError where there is neither.
-    """
-    finished, tiny = [], []
-    for config in Path("runs").glob("*/config.json"):
-        with suppress(OSError, ValueError, KeyError, TypeError):  # of a damaged file
-            arguments = json.loads(config.read_text())["arguments"]
-            last = config.parent / f"ema-{arguments['steps']:05d}.pt"
-            if arguments["suite"] == suite and last.is_file():
-                runs_of_preset = tiny if arguments["preset"] == "tiny" else finished
-                runs_of_preset.append(last)
-    if finished:
-        return max(finished, key=lambda path: path.stat().st_mtime)
-    shipped = SHIPPED_CHECKPOINT.with_name(f"{suite}-small.pt")
-    if not shipped.is_file():
-        if tiny:
-            run = max(tiny, key=lambda path: path.stat().st_mtime).parent
-            raise UserError(
-                f"{run} is a run of `tiny`, which only shows that everything works, and is never "
-                f"taken unasked: train with --preset small, or add --checkpoint {run}"
-            )
-        raise UserError(f"no finished run on {suite} in runs/: train one, or name a --checkpoint")
-    print(
-        f"no finished run on {suite} in runs/: using the policy that comes with the code",
-        flush=True,
-    )
-    return shipped
-
-
-def load_trained(
-    path: str | Path, device: str | torch.device = "cpu", **config_overrides: Any
-) -> tuple[DAMIPolicy, dict[str, Any]]:
-    """`model.load` of a file of train.py or finetune.py; CheckpointError for any other policy."""
-    return model.load(path, device, needs=TRAINED, **config_overrides)
-
-
-def reads_instruction(info: dict[str, Any]) -> bool:
-    """Whether a checkpoint's policy is given its instruction: unless it was adapted without."""
-    return info.get("adaptation", {}).get("instruction", True)
-
-
-def instruction_features(
-    instructions: dict[str, str],
-    weights: str | None,
-    identity: str | None,
-    device: str | torch.device,
-    use_instruction: bool = True,
-) -> tuple[dict[str, Tensor], str]:
-    """Encodes instructions with CLIP's text tower.
-
-    Args:
-        instructions: task -> sentence.
-        weights: those of --clip-weights, see `clip.text_features`.
-        identity: of the weights that must be used, as a checkpoint names them; None: any.
-        device: of the features.
-        use_instruction: False gives zeros in place of every feature.
-
-    Returns:
-        Task -> feature (text_dim,), and the identity of the weights.
-    """
-    features, identity = text_features(list(instructions.values()), weights, identity)
-    if not use_instruction:
-        features = torch.zeros_like(features)
-    return dict(zip(instructions, features.to(device))), identity
+                successes[-1] = False
+                return successes, True
+    return successes, False
 
 
 # ---- Evaluation in worker processes --------------------------------------------------------------
@@ -437,7 +455,7 @@ def cached_policy(
 class PolicyOfTask:
     """Which policy is rolled out on a task, and how it is adapted to it before that.
 
-    It is hashable: a worker process keeps what it loaded, as long as it is asked for the same.
+    It is hashable, so that `lru_cache` keeps the policy from one job of a task to the next.
     """
 
     checkpoint: str | Path
@@ -461,7 +479,7 @@ def adaptation_sampler(
 ) -> WindowSampler:
     """The windows that adapt a checkpoint's policy to a task.
 
-    Late ones are among them as often as in its training, but scenes are left as they are.
+    Late windows are as frequent as in its training, but scenes are not augmented.
     """
     training = info["arguments"]
     return WindowSampler(
@@ -475,7 +493,7 @@ def adaptation_sampler(
 
 @lru_cache(maxsize=1)
 def cached_policy_of_task(wanted: PolicyOfTask) -> tuple[DAMIPolicy, WindowSampler, Tensor]:
-    """A policy for a task, kept until this process works on another task, or in another way.
+    """A policy for a task, kept until this process is asked for any other `PolicyOfTask`.
 
     Returns:
         The policy, adapted to the task where there are inner steps; the windows of the task's
@@ -530,14 +548,13 @@ def evaluate_checkpoint(
         recordings: task -> file with its demonstrations.
         text: task -> instruction feature, (text_dim,).
         episodes: rollouts of each task; episode i has the goal of `evaluation_seed(seed, i)`.
-        seed: chooses goals, noise, reference demonstrations, and what inner steps are taken on.
-            With `known_goals` it chooses the last of these alone and, in simulators with
+        seed: chooses goals, noise, reference demonstrations, and the windows and noise of inner
+            steps. With `known_goals` it chooses only the latter two and, in a simulator with
             `one_demonstration`, the reference demonstration.
         workers: processes; None: one a core.
         device: where the policy runs.
         n_demonstrations: use only the first so many of each recording; None: all.
-        demonstration_control: what the policy reads in place of its demonstration, in inner steps
-            as well, a key of DEMONSTRATION_CONTROLS; None: the demonstration.
+        demonstration_control: of demonstrations in inner steps and rollouts, see `controlled`.
         inner_steps: the policy is adapted to each task by so many steps before, see
             `take_inner_steps`.
         inner_lr: the learning rate of these steps; None: the one or those of its training.
@@ -664,7 +681,7 @@ class ActionError:
     """How far actions are from an expert's: mean absolute errors, of each number of an action."""
 
     of_policy: np.ndarray  # (A,) of the actions that the policy draws, in the action's unit
-    of_mean_action: np.ndarray  # (A,) of always doing the mean action of what was trained on
+    of_mean_action: np.ndarray  # (A,) of always doing the mean action of the training data
 
 
 @torch.no_grad()
@@ -689,8 +706,7 @@ def action_error(
         heldout_sampler: of the episodes to judge by.
         text: instruction feature, (text_dim,).
         demonstrations: one of its episodes is the reference demonstration; None: `train_sampler`.
-        demonstration_control: what the policy reads in place of its demonstration, a key of
-            DEMONSTRATION_CONTROLS; None: the demonstration.
+        demonstration_control: see `controlled`.
     """
     demonstrations = demonstrations or train_sampler
     generator = torch.Generator().manual_seed(0)  # of reference demonstrations and noise
@@ -701,8 +717,7 @@ def action_error(
     for episode in heldout_sampler.episodes:
         demonstration = demonstrations.demonstration(demonstrations.sample_episode(generator))
         demonstration = {name: x.to(device) for name, x in demonstration.items()}
-        if demonstration_control is not None:
-            demonstration = DEMONSTRATION_CONTROLS[demonstration_control](demonstration)
+        demonstration = controlled(demonstration, demonstration_control)
         context = policy.encode_demo(text[None], **demonstration)
 
         newest = torch.arange(episode.start, episode.stop, Ta)[:, None]  # (n, 1) frames
@@ -751,18 +766,7 @@ def evaluate_heldout(
 
 # ---- Animations ----------------------------------------------------------------------------------
 
-FPS = 30
 MAX_FILMS = 3  # in one animation, below each other
-
-
-@dataclass(frozen=True)
-class Frame:
-    """A moment of a rollout, as an animation shows it."""
-
-    step: int
-    success: bool  # whether the step before it reported success
-    picture: np.ndarray  # (240, 240, 3) uint8
-    cloud: np.ndarray  # (N, 3), metres
 
 
 class FilmedEnvironment:
@@ -840,85 +844,11 @@ def write_animation(
                 text=text[sampler.task],
                 generator=torch.Generator().manual_seed(episode_seed),
             )
+            environment.success = successes[-1][-1]  # none, where nothing is seen any more
             environment.film()  # how it ended
             films[sampler.task] = environment.frames
     animate(films, writer, path)
     return successes
-
-
-def animate(films: dict[str, Sequence[Frame]], writer: Any, path: str | Path) -> None:
-    """Writes films, task -> frames, as an animation, with a writer of Matplotlib.
-
-    There is a row for each film, whose title says which of its frames are a success. The last frame
-    stays a while.
-    """
-    from matplotlib.animation import FuncAnimation
-    from matplotlib.figure import Figure
-
-    clouds = np.concatenate([frame.cloud for frames in films.values() for frame in frames])
-    low, high = clouds.min(axis=0), clouds.max(axis=0)
-    figure = Figure(figsize=(6, 3 * len(films)), layout="constrained")
-    rows = []
-    for row in range(len(films)):
-        picture = figure.add_subplot(len(films), 2, 2 * row + 1)
-        cloud = figure.add_subplot(len(films), 2, 2 * row + 2, projection="3d")
-        rows.append((picture, cloud))
-
-    def show(index: int) -> None:
-        for (task, frames), (left, right) in zip(films.items(), rows):
-            frame = frames[min(index, len(frames) - 1)]
-            left.clear()
-            left.imshow(frame.picture)
-            left.set_axis_off()
-            left.set_title(f"{task}: success" if frame.success else task, fontsize=9)
-
-            right.clear()
-            height = frame.cloud[:, 2]
-            right.scatter(*frame.cloud.T, c=height, vmin=low[2], vmax=high[2], cmap="viridis", s=9)
-            right.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-            right.set(xticklabels=[], yticklabels=[], zticklabels=[])
-            right.set_box_aspect(high - low)
-            right.view_init(elev=25, azim=-30)
-            right.set_title(f"{len(frame.cloud)} points, step {frame.step}", fontsize=9)
-
-    shown = max(len(frames) for frames in films.values()) + 10
-    animation = FuncAnimation(figure, show, frames=shown)
-
-    def save(temporary: Path) -> None:
-        with progress_bar(desc="drawing", unit="frame", total=shown) as progress:
-            animation.save(
-                temporary,
-                writer=writer,
-                dpi=70,
-                progress_callback=lambda index, total: progress.update(),
-            )
-
-    write_atomically(path, save)
-
-
-def movie_writer(path: str | Path) -> Any:
-    """Matplotlib's writer of a .gif, or of an .mp4 where there is ffmpeg or imageio-ffmpeg.
-
-    Raises UserError for a file of another kind, one of no folder, or where there is neither.
-    """
-    import matplotlib
-    from matplotlib.animation import FFMpegWriter, PillowWriter
-
-    path = Path(path)
-    if not path.resolve().parent.is_dir():
-        raise UserError(f"cannot write {path}: there is no such folder")
-    if path.suffix == ".gif":
-        return PillowWriter(fps=FPS)
-    if path.suffix != ".mp4":
-        raise UserError(f"cannot write {path}: name it .gif or .mp4")
-    with suppress(ImportError):
-        ffmpeg = import_module("imageio_ffmpeg").get_ffmpeg_exe()
-        matplotlib.rcParams["animation.ffmpeg_path"] = ffmpeg
-    if not FFMpegWriter.isAvailable():
-        raise UserError(
-            f"cannot write {path}: install ffmpeg or `pip install imageio-ffmpeg`, or name it .gif"
-        )
-    return FFMpegWriter(fps=FPS)
 
 
 # ---- Folders of results --------------------------------------------------------------------------
@@ -939,7 +869,7 @@ RESULTS = [
 def claim_results(folder: Path, overwrite: bool) -> list[Path]:
     """Makes a folder for results, and returns the old results in it, which are to be removed.
 
-    The caller removes them once nothing more can be refused, so that a mistake costs nobody their
+    The caller removes them when all checks have passed, so that a mistake costs nobody their
     results. Raises UserError if there are any and `overwrite` is False, or if the folder
     holds a training run, which is never overwritten.
     """
@@ -956,11 +886,13 @@ def claim_results(folder: Path, overwrite: bool) -> list[Path]:
 
 
 def add_inference_flags(parser: Any) -> None:
-    """Adds the flags of what may be different in a rollout than it was in training."""
+    """Adds the flags that change a policy's configuration for rollouts."""
     parser.add_argument(
         "--sampler", choices=("ddim", "dp3"), help="DDIM as published, or as DP3 runs it"
     )
-    parser.add_argument("--n-action-steps", type=int, help="actions until the policy looks again")
+    parser.add_argument(
+        "--n-action-steps", type=int, help="actions that are executed of each chunk"
+    )
     parser.add_argument("--inference-steps", type=int, help="diffusion steps for each chunk")
 
 
@@ -977,7 +909,12 @@ def inference_overrides(args: argparse.Namespace) -> dict[str, Any]:
 def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Measures success in a simulator.")
     add = parser.add_argument
-    add("--checkpoint", nargs="+", help="files or run folders (default: the newest run's last)")
+    add(
+        "--checkpoint",
+        nargs="+",
+        help="files or run folders (default: the newest finished run on the suite but for those of "
+        "`tiny`, or the policy that ships)",
+    )
     add("--suite", help="such as ml10, ml45 (default: the checkpoint's, or ml10)")
     add("--split", choices=("base", "novel", "all"), default="base", help="of the suite's tasks")
     add("--task", nargs="+", help="only these tasks, of the suite's simulator")
@@ -988,7 +925,12 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         help="demonstrations a task (default: 10 or 5, as the suite says)",
     )
     add("--episodes", type=int, default=20, help="episodes a task (default: 20)")
-    add("--top", type=int, default=0, help="all checkpoints, and the mean of the best TOP")
+    add(
+        "--top",
+        type=int,
+        default=0,
+        help="all checkpoints of each run, and the mean of its TOP best",
+    )
     inputs = ("demonstration", "instruction")
     add(
         "--swap",
@@ -997,7 +939,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         default=[],
         help="measure the last checkpoint also with another task's demonstration or instruction",
     )
-    add("--without", nargs="+", choices=inputs, default=[], help="give zeros in place of these")
+    add("--without", nargs="+", choices=inputs, default=[], help="zeros in place of these inputs")
     add(
         "--controls",
         nargs="+",
@@ -1023,7 +965,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "--inner-steps",
         type=int,
         default=0,
-        help="adapt to each task by so many inner steps, as in training, before (default: 0)",
+        help="inner steps, as in training, that adapt the policy to each task first (default: 0)",
     )
     add("--inner-lr", type=float, help="learning rate of these steps (default: as in training)")
     add("--support", type=int, help="windows for these steps (default: as many as in training)")
@@ -1044,15 +986,15 @@ def check_flags(args: argparse.Namespace) -> None:
         if value is not None and value < least:
             raise UserError(f"--{name} is {value}: use at least {least}")
     if args.suite not in (None, "own"):
-        simulator_of(args.suite)  # refuses what there is none of
-    evaluation_seed(args.seed, args.episodes - 1)  # refuses what is out of range
+        simulator_of(args.suite)  # raises UserError for an unknown suite
+    evaluation_seed(args.seed, args.episodes - 1)  # raises UserError where it is out of range
     for name, value in (("inner-lr", args.inner_lr), ("support", args.support)):
         if value is not None and args.inner_steps == 0:
             raise UserError(f"--{name} is for --inner-steps: give both")
     if args.inner_lr is not None and not 0 <= args.inner_lr < math.inf:
         raise UserError(f"--inner-lr is {args.inner_lr}: use a number from 0")
     if args.gif:
-        movie_writer(args.gif)  # refuses what cannot be written
+        movie_writer(args.gif)  # raises UserError for what cannot be written
         not_shown = {
             "--known-goals": args.known_goals,
             "--inner-steps": args.inner_steps,
@@ -1073,7 +1015,14 @@ def check_flags(args: argparse.Namespace) -> None:
     if args.controls and "demonstration" in args.without:
         raise UserError("--controls change the demonstration: leave out --without demonstration")
     if args.swap and args.known_goals:
-        raise UserError("--known-goals are those of a task's own demonstrations: leave out --swap")
+        raise UserError(
+            "--known-goals are those of a task's own demonstrations, and --swap shows another's: "
+            "leave out one of the two"
+        )
+    if args.inner_steps and args.n_action_steps is not None:
+        raise UserError(
+            "--n-action-steps also changes the windows that --inner-steps learn from: leave out one"
+        )
 
 
 @dataclass(frozen=True)
@@ -1089,9 +1038,9 @@ class Checkpoint:
 def choose_checkpoints(
     paths: Sequence[str | Path], top: int, config_overrides: dict[str, Any]
 ) -> list[list[Checkpoint]]:
-    """Of each run the checkpoints to measure, in the order of their steps.
+    """The checkpoints to measure of each run, in the order of their steps.
 
-    Those are all of a run's, or the last one alone where `top` is 0.
+    They are all of a run's, or the last one alone where `top` is 0.
     Raises UserError for a run of fewer than `top` checkpoints, and for two of one label.
     """
     runs = []
@@ -1119,12 +1068,13 @@ def choose_tasks(
 
     `info` is the checkpoint's. Base tasks of its own suite are those that it was trained on.
     """
+    tasks = list(dict.fromkeys(args.task or []))  # each once
     adapted_to = info.get("adapted_to")
-    named = list(dict.fromkeys(args.task or []))  # each once
-    if named and adapted_to and named != [adapted_to]:
-        raise UserError(f"this policy was adapted to {adapted_to}, not to {' '.join(named)}")
-    if named or adapted_to:
-        tasks = named or [adapted_to]
+    if adapted_to is not None:
+        if tasks and tasks != [adapted_to]:
+            raise UserError(f"this policy was adapted to {adapted_to}, not to {' '.join(tasks)}")
+        tasks = [adapted_to]
+    if tasks:
         for task in tasks:
             check_task(simulator, task)
         return tasks
@@ -1137,16 +1087,14 @@ def choose_tasks(
     return {"base": base, "novel": novel, "all": [*base, *novel]}[args.split]
 
 
-def check_together(checkpoints: Sequence[Checkpoint], tasks: Sequence[str]) -> None:
-    """Raises UserError for checkpoints that cannot be measured alike on these tasks."""
+def check_together(checkpoints: Sequence[Checkpoint]) -> None:
+    """Raises UserError for checkpoints that cannot be given the same instruction features."""
     first = checkpoints[0].info
     for checkpoint in checkpoints:
         info = checkpoint.info
         path = checkpoint.path
         if info["text_weights"] != first["text_weights"]:
             raise UserError(f"{path} was made with text weights {info['text_weights']!r}")
-        if "adapted_to" in info and list(tasks) != [info["adapted_to"]]:
-            raise UserError(f"{path} was adapted to {info['adapted_to']}: measure it alone")
         if reads_instruction(info) != reads_instruction(first):
             raise UserError(f"{path}: measure policies with and without --no-instruction apart")
 
@@ -1181,35 +1129,33 @@ def choose_measurements(
     text: dict[str, Tensor],
     args: argparse.Namespace,
 ) -> list[Measurement]:
-    """Every checkpoint with each task's own inputs, and each run's last one with other ones."""
-    control = "zeros" if "demonstration" in args.without else None
-    measurements = [
-        Measurement(checkpoint.label, checkpoint.path, recordings, text, control)
-        for checkpoint in chain(*runs)
-    ]
+    """Every checkpoint with its tasks' own inputs; of each run the last one also with others.
+
+    The others are those of --controls and --swap.
+    """
+    measurements, with_other_inputs = [], []
     for run in runs:
-        last = run[-1]
-        for part in args.controls:
-            measurements.append(
-                Measurement(f"{last.label}, {part}", last.path, recordings, text, part)
+        for checkpoint in run:
+            own = Measurement(
+                label=checkpoint.label,
+                checkpoint=checkpoint.path,
+                recordings=recordings,
+                text=text,
+                demonstration_control="zeros" if "demonstration" in args.without else None,
             )
-        for part in args.swap:
-            measurements.append(
-                Measurement(
-                    label=f"{last.label}, {part} of another task",
-                    checkpoint=last.path,
-                    recordings=of_next_task(recordings) if part == "demonstration" else recordings,
-                    text=of_next_task(text) if part == "instruction" else text,
-                    demonstration_control=control,
-                )
+            measurements.append(own)
+        for control in args.controls:  # from here on, `own` is the run's last checkpoint
+            with_other_inputs.append(
+                replace(own, label=f"{own.label}, {control}", demonstration_control=control)
             )
-    return measurements
-
-
-def of_next_task(inputs: dict[str, Any]) -> dict[str, Any]:
-    """Gives every task what belongs to the next one, and the last what belongs to the first."""
-    values = list(inputs.values())
-    return dict(zip(inputs, [*values[1:], values[0]]))
+        for name in args.swap:
+            label = f"{own.label}, {name} of another task"
+            if name == "demonstration":
+                other = replace(own, label=label, recordings=of_next_task(recordings))
+            else:
+                other = replace(own, label=label, text=of_next_task(text))
+            with_other_inputs.append(other)
+    return [*measurements, *with_other_inputs]
 
 
 def mean_successes(
@@ -1217,17 +1163,29 @@ def mean_successes(
 ) -> dict[str, str]:
     """Means over runs, with their intervals: of the last checkpoint, and of the `top` best ones.
 
-    They are of success at any step.
+    They are of success at any step. Runs are averaged if only their seeds differ.
     """
+    recipes = [{**run[-1].info["arguments"], "seed": None} for run in runs]
+    policies = {run[-1].policy for run in runs}
+    if len(policies) > 1 or any(recipe != recipes[0] for recipe in recipes):
+        means = {}
+        for run in runs:
+            for name, mean in mean_successes(outcomes, [run], parts, top).items():
+                means[f"{run[-1].label}: {name}"] = mean
+        return means
+
     means = {}
     for name, tasks in parts.items():
-        rates = [  # of each run the success rate of each checkpoint, in percent
-            [mean_success({task: outcomes[c.label].any_step[task] for task in tasks}) for c in run]
-            for run in runs
-        ]
-        means[f"{name}, last checkpoint"] = mean_interval([of_run[-1] for of_run in rates])
+        last, best = [], []  # of each run, in percent
+        for run in runs:
+            rates = []  # of each of its checkpoints
+            for checkpoint in run:
+                any_step = outcomes[checkpoint.label].any_step
+                rates.append(mean_success({task: any_step[task] for task in tasks}))
+            last.append(rates[-1])
+            best.append(float(np.mean(sorted(rates)[-top:])))
+        means[f"{name}, last checkpoint"] = mean_interval(last)
         if top:
-            best = [float(np.mean(sorted(of_run)[-top:])) for of_run in rates]
             means[f"{name}, best {top} checkpoints"] = mean_interval(best)
     return means
 
@@ -1266,11 +1224,17 @@ def watch(
     device: torch.device,
 ) -> None:
     """--gif: animates one rollout of each task."""
+    if len(tasks) > MAX_FILMS:
+        raise UserError(
+            f"--gif draws at most {MAX_FILMS} rollouts: name their tasks, --task reach --gif x.gif"
+        )
     _, novel = simulator.tasks(suite)
     needs_adaptation = checkpoint.info["arguments"].get("evaluate_on") != "novel"
     for task in tasks:
         if "adapted_to" not in checkpoint.info and task in novel and needs_adaptation:
-            adapt = f"python finetune.py --task {task}"
+            adapt = (
+                f"python finetune.py --task {task} --suite {suite} --checkpoint {checkpoint.path}"
+            )
             print(f"{task} is novel to this policy: `{adapt}`, then --checkpoint with its folder")
     policy, info = load_trained(checkpoint.path, device, **inference_overrides(args))
     recordings, text, _ = load_inputs(args, simulator, tasks, info, device)
@@ -1308,7 +1272,7 @@ def measure(
     recordings, text, identity = load_inputs(args, simulator, tasks, info, device)
     if args.known_goals:
         for recording in recordings.values():
-            episode_seeds_of(recording)  # refuses one without, before old results are removed
+            episode_seeds_of(recording)  # raises UserError while old results are still there
 
     outcomes = {}
     with WorkerPool(args.workers) as pool:
@@ -1335,6 +1299,10 @@ def measure(
             )
 
     parts = group_tasks(tasks, simulator, suite)
+    inner_settings = {}
+    if args.inner_steps > 0:
+        inner_settings["inner rate"] = "as in training" if args.inner_lr is None else args.inner_lr
+        inner_settings["support"] = args.support or "as in training"
     by_name = args.task or "adapted_to" in info
     provenance = {
         "title": " ".join(tasks) if by_name else f"{suite}, {args.split} tasks",
@@ -1343,8 +1311,7 @@ def measure(
         "goals": "of the demonstrations, each once" if args.known_goals else "new",
         "left out": " and ".join(args.without) or "nothing",
         "inner steps": args.inner_steps,
-        "inner rate": "as in training" if args.inner_lr is None else args.inner_lr,
-        "support": args.support or "as in training",
+        **inner_settings,
         "text weights": identity,
         **common.provenance("evaluate.py", argv, device),
         **inference_overrides(args),
@@ -1358,7 +1325,7 @@ def measure(
         provenance,
         parts=parts,
         paper=paper_columns(suite, dict.fromkeys(run[-1].policy for run in runs)),
-        checkpoints=outcomes if args.top else None,
+        checkpoints={c.label: outcomes[c.label] for c in chain(*runs)} if args.top else None,
         pooled=info["arguments"].get("evaluate_on") == "novel" and len(shown) > 1,
     )
     print(f"\n{table}\n")
@@ -1382,25 +1349,20 @@ def main(argv: list[str] | None = None) -> None:
     if args.demonstrations is None:
         args.demonstrations = simulator.demonstrations
     tasks = choose_tasks(args, simulator, suite, info)
-    check_together(list(chain(*runs)), tasks)
+    check_together(list(chain(*runs)))
     for checkpoint in chain(*runs):
         if choose_tasks(args, simulator, suite, checkpoint.info) != tasks:
             raise UserError(
-                f"{checkpoint.path} was trained on other base tasks: measure it alone, or name "
-                "--task or --split novel"
+                f"{checkpoint.path} and {runs[0][-1].path} are for different tasks: "
+                "name --task, or measure each alone"
             )
     if args.swap and len(tasks) < 2:
         raise UserError(
-            "--swap takes from another of the tasks that are measured, and this is one alone: name "
-            "two --task, or measure a split"
+            "--swap gives a task the input of another one that is measured, and this is one alone: "
+            "name two --task, or measure a split"
         )
 
     if args.gif:
-        if len(tasks) > MAX_FILMS:
-            raise UserError(
-                f"--gif draws at most {MAX_FILMS} rollouts: "
-                "name their tasks, --task reach --gif x.gif"
-            )
         watch(
             args,
             checkpoint=runs[0][-1],

@@ -13,6 +13,7 @@ Letters: T frames, N points.
 import json
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations, product
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from common import format_table, read_json_lines
+from common import UserError, format_table, progress_bar, read_json_lines
 from data import Demonstrations, positions, write_atomically, write_text
 
 Successes = dict[str, list[bool]]  # task -> one entry an episode
@@ -216,33 +217,28 @@ def write_report(
             They are written into success.json, and stand in no table.
         pooled: table and chart put the episodes of all tasks together: a row for each label.
     """
-    kinds = {"any step": {}, "at the end": {}, "the other task": {}}  # -> label -> successes
-    for label, outcome in outcomes.items():
-        of_kinds = (outcome.any_step, outcome.at_end, outcome.other_task)
-        for kind, successes in zip(kinds, of_kinds):
-            if successes is not None:
-                kinds[kind][label] = successes
+    any_step = {label: o.any_step for label, o in outcomes.items()}
+    at_end = {label: o.at_end for label, o in outcomes.items() if o.at_end is not None}
+    other_task = {label: o.other_task for label, o in outcomes.items() if o.other_task is not None}
     if pooled:
+        kinds = {"any step": any_step, "at the end": at_end, "the other task": other_task}
         columns = {kind: pool_tasks(of_kind) for kind, of_kind in kinds.items() if of_kind}
         table = success_table(columns, parts={}, first_title="success, percent")
     else:
-        columns = {}
-        for kind, of_kind in kinds.items():
-            for label, successes in of_kind.items():
-                columns[label if kind == "any step" else f"{label}, {kind}"] = successes
+        columns = dict(any_step)
+        for label, successes in at_end.items():
+            columns[f"{label}, at the end"] = successes
+        for label, successes in other_task.items():
+            columns[f"{label}, the other task"] = successes
         table = success_table(columns, parts, paper)
-    report = {
-        "provenance": provenance,
-        "successes": kinds["any step"],
-        "successes at the end": kinds["at the end"],
-    }
-    if kinds["the other task"]:
-        report["successes at the other task"] = kinds["the other task"]
+    report = {"provenance": provenance, "successes": any_step, "successes at the end": at_end}
+    if other_task:
+        report["successes at the other task"] = other_task
     if checkpoints:
         report["checkpoints"] = {label: outcome.any_step for label, outcome in checkpoints.items()}
     note = ", ".join(f"{name} {value}" for name, value in provenance.items())
-    measured = "at any step, or at the end" if kinds["at the end"] else "at any step"
-    if kinds["the other task"]:
+    measured = "at any step, or at the end" if at_end else "at any step"
+    if other_task:
         measured += ", or, at any step, at the other task of the pair"
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -470,3 +466,93 @@ def plot_box(axes: Any, corners: np.ndarray | None, color: str) -> None:
     for a, b in combinations(vertices, 2):
         if np.equal(a, b).sum() == 2:  # they differ along one axis: an edge
             axes.plot(*zip(a, b), color=color, lw=0.5)
+
+
+# ---- Animations of rollouts ----------------------------------------------------------------------
+
+FPS = 30
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A moment of a rollout, as an animation shows it."""
+
+    step: int
+    success: bool  # whether the step before it reported success
+    picture: np.ndarray  # (240, 240, 3) uint8
+    cloud: np.ndarray  # (N, 3), metres
+
+
+def animate(films: dict[str, Sequence[Frame]], writer: Any, path: str | Path) -> None:
+    """Writes films, task -> frames, as an animation, with a writer of Matplotlib.
+
+    There is a row for each film, whose title says which of its frames are a success. The last frame
+    stays a while.
+    """
+    from matplotlib.animation import FuncAnimation
+    from matplotlib.figure import Figure
+
+    low, high = bounding_box([frame.cloud for frames in films.values() for frame in frames])
+    figure = Figure(figsize=(6, 3 * len(films)), layout="constrained")
+    rows = []
+    for row in range(len(films)):
+        picture = figure.add_subplot(len(films), 2, 2 * row + 1)
+        cloud = figure.add_subplot(len(films), 2, 2 * row + 2, projection="3d")
+        rows.append((picture, cloud))
+
+    def show(index: int) -> None:
+        for (task, frames), (left, right) in zip(films.items(), rows):
+            frame = frames[min(index, len(frames) - 1)]
+            left.clear()
+            left.imshow(frame.picture)
+            left.set_axis_off()
+            left.set_title(f"{task}: success" if frame.success else task, fontsize=9)
+
+            right.clear()
+            height = frame.cloud[:, 2]
+            right.scatter(*frame.cloud.T, c=height, vmin=low[2], vmax=high[2], cmap="viridis", s=9)
+            right.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+            right.set(xticklabels=[], yticklabels=[], zticklabels=[])
+            right.set_box_aspect(high - low)
+            right.view_init(elev=25, azim=-30)
+            right.set_title(f"{len(frame.cloud)} points, step {frame.step}", fontsize=9)
+
+    num_pictures = max(len(frames) for frames in films.values()) + 10
+    animation = FuncAnimation(figure, show, frames=num_pictures)
+
+    def save(temporary: Path) -> None:
+        with progress_bar(desc="drawing", unit="frame", total=num_pictures) as progress:
+            animation.save(
+                temporary,
+                writer=writer,
+                dpi=70,
+                progress_callback=lambda index, total: progress.update(),
+            )
+
+    write_atomically(path, save)
+
+
+def movie_writer(path: str | Path) -> Any:
+    """Matplotlib's writer of a .gif, or of an .mp4 where there is ffmpeg or imageio-ffmpeg.
+
+    Raises UserError for a file of another kind, one of no folder, or where there is neither.
+    """
+    import matplotlib
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    path = Path(path)
+    if not path.resolve().parent.is_dir():
+        raise UserError(f"cannot write {path}: there is no such folder")
+    if path.suffix == ".gif":
+        return PillowWriter(fps=FPS)
+    if path.suffix != ".mp4":
+        raise UserError(f"cannot write {path}: name it .gif or .mp4")
+    with suppress(ImportError):
+        import imageio_ffmpeg
+
+        matplotlib.rcParams["animation.ffmpeg_path"] = imageio_ffmpeg.get_ffmpeg_exe()
+    if not FFMpegWriter.isAvailable():
+        raise UserError(
+            f"cannot write {path}: install ffmpeg or `pip install imageio-ffmpeg`, or name it .gif"
+        )
+    return FFMpegWriter(fps=FPS)

@@ -7,6 +7,7 @@ import json
 import runpy
 import sys
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import fails, same_bits
-from toy_simulator import COLORS, ToySimulator
+from toy_simulator import COLORS, ToyEnvironment, ToySimulator
 
 import clip
 import common
@@ -732,7 +733,7 @@ def test_base_tasks_are_those_that_the_policy_was_trained_on(run, recordings, ca
     Path("other").mkdir()
     torch.save(content, "other/ema-00006.pt")
     both = [*command(run, recordings, "--episodes 1 --out both"), "--checkpoint", str(run), "other"]
-    assert "other/ema-00006.pt was trained on other base tasks" in fails(evaluate, both, capsys)
+    assert "are for different tasks: name --task, or measure" in fails(evaluate, both, capsys)
 
 
 def test_the_best_checkpoints_of_a_run_are_averaged(run, recordings, monkeypatch, capsys):
@@ -741,13 +742,31 @@ def test_the_best_checkpoints_of_a_run_are_averaged(run, recordings, monkeypatch
         return report.Outcomes(any_step=of_tasks, at_end=of_tasks)
 
     monkeypatch.setattr(evaluate, "evaluate_checkpoint", measured)
-    evaluate.main(command(run, recordings, "--episodes 2 --top 1 --out report"))
+    swap = "--swap instruction"  # is no checkpoint
+    evaluate.main(command(run, recordings, f"--episodes 2 --top 1 {swap} --out report"))
     written = report_of("report")
     assert written["provenance"]["mean, last checkpoint"] == "50.0 (one run)"
     assert written["provenance"]["mean, best 1 checkpoints"] == "100.0 (one run)"
-    assert list(written["successes"]) == ["toy-tiny-seed0/ema-00006"]
-    assert len(written["checkpoints"]) == 2
+    last = "toy-tiny-seed0/ema-00006"
+    assert list(written["successes"]) == [last, f"{last}, instruction of another task"]
+    assert list(written["checkpoints"]) == ["toy-tiny-seed0/ema-00003", last]
     assert "best 1 checkpoints" in capsys.readouterr().out
+
+
+def test_runs_are_averaged_if_only_their_seeds_differ():
+    def run_of(seed, policy="dami", lr=1e-3):
+        info = {"arguments": {"seed": seed, "lr": lr}}
+        return [evaluate.Checkpoint(Path(f"{seed}.pt"), f"run-{seed}/ema", policy, info)]
+
+    outcomes = {f"run-{s}/ema": report.Outcomes({"reach": [s > 0]}, None) for s in (0, 1)}
+    means = partial(evaluate.mean_successes, outcomes, parts={"mean": ["reach"]}, top=0)
+    assert list(means(runs=[run_of(0), run_of(1)])) == ["mean, last checkpoint"]
+    apart = {
+        "run-0/ema: mean, last checkpoint": "0.0 (one run)",
+        "run-1/ema: mean, last checkpoint": "100.0 (one run)",
+    }
+    assert means(runs=[run_of(0), run_of(1, lr=5e-4)]) == apart
+    assert means(runs=[run_of(0), run_of(1, policy="dp3")]) == apart
 
 
 def test_inputs_are_swapped_with_those_of_the_next_task_or_left_out(run, recordings, monkeypatch):
@@ -966,6 +985,54 @@ def test_every_second_step_and_the_last_moment_are_filmed(trained, recordings, m
     assert again == successes
 
 
+class Vanishing(ToyEnvironment):
+    """Succeeds at every step, until nothing is seen any more."""
+
+    def begin(self, seed):
+        super().begin(seed)
+        self.observed = 0
+
+    def observe(self):
+        self.observed += 1
+        if self.steps >= 8 or self.hidden:
+            raise simulator.OutOfSightError("gone")
+        cloud = super().observe()["point_cloud"]
+        cloud[:, 2] = 0.5  # all at one height, as in a plane
+        return {"point_cloud": cloud, "agent_pos": np.float32(self.hand)}
+
+    def advance(self, action):
+        reward, truncated, _ = super().advance(action)
+        return reward, truncated, {"success": True}
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_an_episode_in_which_nothing_is_seen_any_more_is_filmed_as_the_failure_that_it_is(
+    trained, recordings, hidden, monkeypatch, capsys
+):
+    class Simulator(ToySimulator):
+        def make(self, task, num_points):
+            environment = Vanishing(None, num_points, self.episode_steps)
+            environment.hidden = hidden  # from the start
+            return environment
+
+    films = []
+    animate = evaluate.animate
+    monkeypatch.setattr(evaluate, "animate", lambda *x: (films.append(x[0]), animate(*x)))
+    sampler = data.WindowSampler(data.load_demonstrations(recordings["touch-red"]), TINY)
+    text, _ = features(["touch-red"], None, None)
+    arguments = [trained, Simulator(), [sampler], {"touch-red": text[0]}]
+    if hidden:
+        message = "touch-red: nothing is seen at the start of the episode of seed"
+        with pytest.raises(evaluate.UserError, match=message):
+            evaluate.write_animation(*arguments, seed=2, path=Path("x.gif"))
+        return
+    [successes] = evaluate.write_animation(*arguments, seed=2, path=Path("x.gif"))
+    [film] = films
+    assert successes == [True] * 7 + [False]
+    assert [frame.success for frame in film["touch-red"]][-2:] == [True, False]
+    assert Path("x.gif").read_bytes().startswith(b"GIF8")  # also of a plane
+
+
 def test_an_adapted_policy_is_watched_from_its_folder(
     run, trained, recordings, monkeypatch, capsys
 ):
@@ -987,11 +1054,12 @@ def test_an_adapted_policy_is_watched_from_its_folder(
     fails(evaluate, command(run, recordings, "--out all/touch-blue --overwrite"), capsys)
     assert Path("all/touch-blue/adapted-00005.pt").exists()
     evaluate.main(command(run, recordings, "--gif x.gif --task touch-blue"))
-    assert "touch-blue is novel to this policy: `python finetune.py" in capsys.readouterr().out
+    advice = f"`python finetune.py --task touch-blue --suite toy --checkpoint {run}/ema-00006.pt`"
+    assert f"touch-blue is novel to this policy: {advice}" in capsys.readouterr().out
 
 
 def test_a_movie_is_written_by_what_is_there(monkeypatch):
-    assert evaluate.movie_writer("x.gif").fps == evaluate.FPS
+    assert evaluate.movie_writer("x.gif").fps == report.FPS
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(evaluate.UserError, match="install ffmpeg or `pip install imageio-ffmpeg`"):
@@ -1007,7 +1075,7 @@ def test_a_movie_is_written_by_what_is_there(monkeypatch):
 @pytest.mark.parametrize(
     "options, message",
     [
-        ("--checkpoint none.pt", "none.pt"),
+        ("--checkpoint none.pt", "no checkpoint at none.pt"),
         ("--episodes 0", "--episodes is 0: use at least 1"),
         ("--episodes 100001", "use fewer --episodes"),
         ("--demonstrations 0", "--demonstrations is 0: use at least 1"),
@@ -1023,7 +1091,8 @@ def test_a_movie_is_written_by_what_is_there(monkeypatch):
         ("--inner-steps 1 --inner-lr nan", "--inner-lr is nan: use a number from 0"),
         ("--top -1", "--top is -1: use at least 0"),
         ("--top 5", "holds 2 checkpoints, fewer than --top"),
-        ("--swap instruction --known-goals", "leave out --swap"),
+        ("--swap instruction --known-goals", "shows another's: leave out one of the two"),
+        ("--inner-steps 1 --n-action-steps 4", "windows that --inner-steps learn from: leave out"),
         ("--swap instruction --task touch-red", "name two --task"),
         ("--swap instruction --task touch-red touch-red", "name two --task"),
         ("--controls last-frame --without demonstration", "leave out --without demonstration"),
@@ -1059,7 +1128,7 @@ def test_a_mistake_ends_in_one_line_that_says_what_to_do(
             "--task touch-red",
             "was adapted to touch-blue, not to touch-red",
         ),
-        ({"adapted_to": "touch-blue"}, ["run"], "", "was adapted to touch-blue: measure it alone"),
+        ({"adapted_to": "touch-blue"}, ["run"], "", "are for different tasks: name --task, or"),
         (
             {"adaptation": {"instruction": False}},
             ["run"],
@@ -1079,6 +1148,9 @@ def test_a_checkpoint_that_cannot_be_measured_so_is_refused(
     if others:
         argv.insert(2, "other.pt")
     assert message in fails(evaluate, argv, capsys)
+    if others:  # in the other order, too
+        argv[1:3] = argv[2:0:-1]
+        fails(evaluate, argv, capsys)
 
 
 def test_without_any_policy_the_user_is_told_how_to_make_one(monkeypatch, capsys):
