@@ -5,10 +5,10 @@
     python finetune.py --data demos.npz --steps 500  # own demonstrations, in data.py's format
     python finetune.py --task shelf-place --inner-steps 5    # as meta-training adapts, see below
 
-The EMA policy of meta-training is trained on with AdamW, each step on windows of the task's
-demonstrations and one of them as reference; its three parts have learning rates of their own, which
-stay constant. What is kept is an EMA again. A task of a simulator is rolled out before and after:
-the difference is what adaptation bought.
+Training goes on from the averaged weights of meta-training, with AdamW. Each step reads windows of
+the task's demonstrations, and one demonstration as reference. The three parts of the policy have
+learning rates of their own, which stay constant. The moving average is kept, as in meta-training. A
+task of a simulator is rolled out before and after: the difference is what adaptation bought.
 
 With `--inner-steps`, the adaptation is the one that meta-training differentiates (Eq. 2): so many
 steps of plain gradient descent on one batch of windows, with the inner learning rates of training,
@@ -79,9 +79,11 @@ class Settings:
     inner_lr: float | None = setting(
         None, "learning rate of the inner steps (default: training's, learned or fixed)", least=0
     )
-    instruction: bool = setting(True, "--no-instruction: adapt and roll out without it")
+    instruction: bool = setting(True, "read the instruction (default: yes)")
     normalizer: str = setting(
-        "fit", "fit it to the task's data, or keep that of training", choices=("fit", "keep")
+        "fit",
+        "fit it to the task's data (the default), or keep that of training",
+        choices=("fit", "keep"),
     )
     demonstrations: int | None = setting(
         None, "how many (default: 10 or 5, as the suite says; of a file all)", least=1
@@ -89,7 +91,7 @@ class Settings:
     held_out: int = setting(
         0, "how many of them, the last ones, are kept for measuring alone (default: 0)", least=0
     )
-    episodes: int = setting(20, "rollouts before and after (default: 20)", least=0)
+    episodes: int = setting(20, "rollouts a task, before and after (default: 20)", least=0)
     seed: int = setting(0, "of batches, noise and goals (default: 0)", least=0, most=999)
 
     def __post_init__(self) -> None:
@@ -109,7 +111,7 @@ def adapt_policy(
     learning_rates: dict[str, float],
     seed: int = 0,
 ) -> Iterator[tuple[int, float, DAMIPolicy]]:
-    """Adapts a copy of a policy to the demonstrations of one task (Algorithm 2 without its line 3).
+    """Adapts a copy of a policy to the demonstrations of one task (Algorithm 2, lines 2, 5 to 17).
 
     Args:
         policy: the meta-trained (EMA) policy; it is left as it is.
@@ -182,7 +184,7 @@ def resolve(settings: Settings, info: dict[str, Any]) -> Settings:
     """Fills in what the settings leave open: the windows a step, and the learning rates.
 
     Both depend on the training that a checkpoint tells of beside its weights (`info`). The paper's
-    learning rates belong to a meta-training at 1e-4; to another one they are in proportion. Inner
+    learning rates are for a meta-training at 1e-4, and are scaled by the rate of this one. Inner
     steps are as in training; where it learned their rates, `inner_lr` stays None.
     """
     if settings.inner_steps is not None:
@@ -197,11 +199,11 @@ def resolve(settings: Settings, info: dict[str, Any]) -> Settings:
             normalizer="keep",
         )
     scale = info["arguments"]["lr"] / PAPER_LEARNING_RATE
-    numbers = {"batch": BATCH[info["preset"]]}
+    rates = {}
     for part, rate in LEARNING_RATES.items():
-        numbers[f"lr_{part}"] = rate * scale
-    left_open = {name: x for name, x in numbers.items() if getattr(settings, name) is None}
-    return replace(settings, **left_open)
+        of_flag = getattr(settings, f"lr_{part}")
+        rates[f"lr_{part}"] = rate * scale if of_flag is None else of_flag
+    return replace(settings, batch=settings.batch or BATCH[info["preset"]], **rates)
 
 
 def log_heldout_error(
@@ -232,11 +234,11 @@ class Adaptation:
     recording: Path  # a file with the task's demonstrations
     folder: Path  # what is written goes there
     settings: Settings
-    curve: Sequence[int]  # after so many steps each, a checkpoint is written and rolled out as well
+    curve: Sequence[int]  # steps after which a checkpoint is also written and rolled out
     config_overrides: dict[str, Any]  # of the policy's configuration, see `inference_overrides`
 
     def describe(self) -> dict[str, Any]:
-        """What config.json says beside the seconds: all that decides the results."""
+        """All that decides the results, for config.json."""
         return {
             "checkpoint": str(self.checkpoint),
             "data": str(self.recording),
@@ -480,18 +482,24 @@ def read_measured(
     measured = {}
     for task, adaptation in adaptations.items():
         folder = adaptation.folder
-        if not (folder / "success.json").is_file() or not (folder / "config.json").is_file():
+        if not (folder / "config.json").is_file():  # it is written when the adaptation is finished
             continue
-        config = json.loads((folder / "config.json").read_text())
-        seconds = config.pop("seconds")
+        try:
+            config = json.loads((folder / "config.json").read_text())
+            seconds = config["seconds"]
+        except (ValueError, TypeError, KeyError):  # not of finetune.py
+            raise UserError(f"{folder} holds other results: choose another --out") from None
         expected = adaptation.describe()
-        changed = [name for name, value in expected.items() if config.get(name) != value]
-        if changed:
+        different = [name for name, value in expected.items() if config.get(name) != value]
+        if different:
             raise UserError(
-                f"{folder} was made with another {', '.join(changed)}: give the same as then, or "
+                f"{folder} was made with another {', '.join(different)}: give the same as then, or "
                 "--overwrite it without --resume"
             )
-        measured[task] = (report.read_outcomes(folder), seconds)
+        if (folder / "success.json").is_file():
+            measured[task] = (report.read_outcomes(folder), seconds)
+        elif adaptation.settings.episodes == 0 and (folder / "adapted.pt").is_file():
+            measured[task] = ({}, seconds)
     return measured
 
 
@@ -572,13 +580,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     simulator = simulator_of(suite) if simulated else None
     if recording is None:
         tasks = choose_tasks(args.task, simulator, suite)
+        paths = {task: Path(args.data) / f"{task}.npz" for task in tasks}
         if settings.demonstrations is None:  # of a file all are used
             settings = replace(settings, demonstrations=simulator.demonstrations)
     else:
         check_recording(recording, file, args.task, simulator)
         tasks = [recording.task]
+        paths = {recording.task: file}
 
-    # Results of one task stand in the folder itself, those of several in a folder each
+    # One task writes into `out` itself; of several, each writes into a folder of its own in it
     name = "novel" if args.task == ["novel"] else "-".join(tasks)
     out = Path(args.out or f"runs/finetune/{name}-seed{settings.seed}")
     several = len(tasks) > 1 or args.task == ["novel"]
@@ -589,13 +599,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     with common.locked(out):
         if args.resume and (out / "adapted.pt").exists():
             raise UserError(f"{out} holds the policy of one task: choose another --out")
+        if args.resume and (out / "config.json").exists():
+            raise UserError(f"{out} holds other results: choose another --out")
         finished = all((folder / "config.json").exists() for folder in folders.values())
         if args.resume and (out / "success.json").exists() and not finished:
             raise UserError(f"{out} holds other results: choose another --out")
-        if recording is None:
-            paths = {task: Path(args.data) / f"{task}.npz" for task in tasks}
-        else:
-            paths = {recording.task: file}
         adaptations = {
             task: Adaptation(
                 checkpoint=checkpoint,

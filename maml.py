@@ -29,6 +29,7 @@ function `loss_fn(params, batch) -> scalar tensor`; with a `torch.nn.Module` tha
 
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
+from functools import partial
 from inspect import signature
 from itertools import islice
 from typing import Any
@@ -157,23 +158,18 @@ def chunk_gradient(
         and the query losses (tasks,).
     """
     rates = lr if isinstance(lr, dict) else {}
-
-    def adapt_to(support: Any, params: Params) -> Params:
-        return adapt(loss_fn, params, support, lr, steps, first_order)
-
-    def query_gradient(query: Any, adapted: Params) -> tuple[Params, Tensor]:
-        return grad_and_value(loss_fn)(adapted, query)
-
+    adapt_task = partial(adapt, loss_fn, lr=lr, steps=steps, first_order=first_order)
+    query_gradient = grad_and_value(loss_fn)
     if len(chunk) == 1:
         support, query = chunk[0]
     else:
         support, query = tree_map(lambda *parts: torch.stack(parts), *chunk)
-        adapt_to = torch.vmap(adapt_to, in_dims=(0, None))
+        adapt_task = torch.vmap(adapt_task, in_dims=(None, 0))
         query_gradient = torch.vmap(query_gradient)
 
     with RightUnderVmap() if len(chunk) > 1 else nullcontext():
-        adapted = adapt_to(support, params)  # theta'_i, with the graph that leads to theta
-        v, losses = query_gradient(query, {name: p.detach() for name, p in adapted.items()})
+        adapted = adapt_task(params, support)  # theta'_i, with the graph that leads to theta
+        v, losses = query_gradient({name: p.detach() for name, p in adapted.items()}, query)
         # sum_i (I - alpha H_i) v_i: the query gradients, taken back through the inner loops
         g = torch.autograd.grad(
             outputs=list(adapted.values()),

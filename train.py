@@ -9,9 +9,9 @@
 
 `meta_train` is Algorithm 1, `task_batch` draws what it reads; `run` does what happens around it.
 
-Whatever is random in outer step k follows from (seed, k, task) alone. On a CPU, with as many
-threads, a run that was killed and resumed therefore ends with the same bits as one that was not,
-and tasks may be shared among processes without changing what they draw.
+The random numbers of a batch follow from the seed, the outer step and the number of the task. So a
+run that is killed and resumed ends with the same bits as one that is not, on a CPU with the same
+number of threads; and processes that share the tasks draw what a single one would.
 """
 
 import argparse
@@ -22,9 +22,8 @@ import math
 import os
 import shlex
 import time
-import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from functools import partial
@@ -94,20 +93,20 @@ class Settings:
     query: int = setting(88, "windows a task for the outer loss", least=1)
     inner_lr: float = setting(1e-4, "learning rate of the inner step", least=0)
     learn_inner_lr: bool = setting(
-        False, "learn a rate of the inner step for each tensor of weights, from --inner-lr on"
+        False, "learn a rate of the inner step for each tensor of weights, starting from --inner-lr"
     )
     rate_lr: float = setting(
-        1e-2, "peak learning rate of AdamW for the logarithms of these rates", least=0
+        1e-2, "peak learning rate of AdamW for the logarithms of learned inner rates", least=0
     )
     lr: float = setting(1e-4, "peak learning rate of AdamW", least=0)
     warmup: int = setting(500, "steps of linear warm-up", least=0)
     pretrain_fraction: float = setting(
-        0.0, "fraction of the steps, the first ones, without an inner step", least=0, most=1
+        0.0, "fraction of the outer steps, at the beginning, without an inner step", least=0, most=1
     )
     vectorize: int = setting(1, "tasks that run at once; memory grows with them", least=1)
     bfloat16: bool = setting(False, "compute steps without an inner step in bfloat16")
     after_success: int | None = setting(
-        None, "a window that begins more than so many frames after success is late", least=0
+        None, "windows that begin more than this many frames after success are late", least=0
     )
     late_fraction: float = setting(
         0.0, "fraction of late windows in a batch; 0 leaves them out", least=0, most=1
@@ -148,92 +147,6 @@ class Settings:
         return self.steps if self.maml == "off" else round(self.pretrain_fraction * self.steps)
 
 
-# What a preset changes; the architecture of the same name is in baselines.PRESETS.
-# fmt: off
-SETTINGS = {
-    "paper": Settings(),
-    "small": Settings(
-        preset="small", steps=8_000, support=4, query=12, lr=1e-3, warmup=100,
-        pretrain_fraction=0.9,  # a step without an inner step takes a third of the time
-        after_success=20,  # three fifths of the experts' frames are later ...
-        late_fraction=0.15,  # ... and show how to stay; many of them cost success elsewhere
-        instruction_dropout=0.2,  # otherwise the policy ignores the demonstration
-        task_dropout=0.25, inner_lr=3e-3,  # without task inputs the inner step must find the task
-        vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=8_000,
-    ),
-    "tiny": Settings(
-        preset="tiny", steps=30, support=4, query=8, inner_lr=1e-3, lr=3e-3, warmup=5, vectorize=10,
-        after_success=20, demonstrations=2, checkpoint_every=15, evaluate_every=30, episodes=2,
-    ),
-}
-# fmt: on
-
-
-# In the suites below episodes are short, and end soon after their success: no window is late.
-ALL_WINDOWS = {"after_success": None, "late_fraction": 0.0}
-
-# What a suite of hidden goals changes, in every preset. The instruction tells nothing, and need
-# not be left out for the demonstration to be read. One map moves all scenes of a task, which makes
-# new goals; a map of each scene's own would hide the goal. What was learned is measured on novel
-# goals, without adapting to them.
-HIDDEN_GOALS = {
-    "base_tasks": 160,
-    "demonstrations": 3,  # one to read, one for the support windows, one for the query windows
-    "tasks_per_step": 16,
-    "augment": True,
-    "one_map": True,
-    "instruction_dropout": 0.0,
-    "task_dropout": 0.0,
-    **ALL_WINDOWS,
-    "evaluate_on": "novel",
-    "episodes": 2,
-}
-# What it changes besides in `small`: many goals a step, and few windows of each. At the learning
-# rate of other suites, 1e-3, one of two trainings got stuck at a loss at which the goal is read
-# only in part. Where the hand has to find the puck first, more steps are needed.
-HIDDEN_GOALS_SMALL = {
-    "lr": 5e-4,
-    "tasks_per_step": 40,
-    "support": 1,
-    "query": 1,
-    "pretrain_fraction": 0.97,
-    "checkpoint_every": 500,
-    "evaluate_every": 3_000,
-}
-HIDDEN_GOALS_STEPS = {"reach": 1_500, "push": 3_000, "pick-place": 3_000}  # of `small`
-
-# What pairs change. The instruction does not tell the task, so leaving it out teaches nothing.
-PAIRS = {"instruction_dropout": 0.0, **ALL_WINDOWS}
-
-# What turned actions change. Augmentation also stretches scenes, and so would change the angle.
-CONVENTION = {
-    "demonstrations": 8,
-    "augment": False,
-    "instruction_dropout": 0.0,
-    **ALL_WINDOWS,
-    "evaluate_on": "novel",
-    "episodes": 5,
-}
-SUITE_SETTINGS = {
-    "goals-reach": HIDDEN_GOALS,
-    "goals-push": HIDDEN_GOALS,
-    "goals-pick-place": HIDDEN_GOALS,
-    "pairs": PAIRS,
-    "convention-reach": CONVENTION,
-    "convention-push": CONVENTION,
-}
-
-
-def preset_settings(preset: str, suite: str) -> Settings:
-    """A preset's settings on a suite; goals-reach-validation has those of goals-reach."""
-    name = suite.removesuffix("-validation")
-    changes = dict(SUITE_SETTINGS.get(name, {}))
-    if preset == "small" and name.startswith("goals-"):
-        steps = HIDDEN_GOALS_STEPS[name.removeprefix("goals-")]
-        changes.update(HIDDEN_GOALS_SMALL, steps=steps)
-    return replace(SETTINGS[preset], suite=suite, **changes)
-
-
 # ---- Algorithm 1 ---------------------------------------------------------------------------------
 
 
@@ -249,7 +162,7 @@ def task_batch(
     """Draws n windows, a complete reference demonstration, noise and timesteps (lines 5, 6 and 9).
 
     The first `settings.support` windows are the support set. With three or more episodes, support
-    and query windows come from different ones.
+    and query windows come from different ones; the paper draws both from the same.
 
     Where the instruction names the task, a policy need read nothing else. In a fraction of the
     batches (`instruction_dropout`) zeros therefore take its place, and only the demonstration tells
@@ -304,7 +217,7 @@ def multi_task_gradient(
 
 
 def rate_in_training(log_rates: dict[str, Tensor], settings: Settings) -> InnerRate:
-    """The inner learning rate as maml.py takes it: those that are learned, or the setting."""
+    """alpha, as maml.py takes it: the learned rate of each tensor, or the one of --inner-lr."""
     if not log_rates:
         return settings.inner_lr
     return {name: log_rate.exp() for name, log_rate in log_rates.items()}
@@ -317,11 +230,12 @@ def maml_gradient(
     settings: Settings,
     vectorize: int,
 ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
-    """The gradient of the query loss through each task's inner step (lines 4 to 19).
+    """The gradient of the query loss through each task's inner step (lines 7 to 19).
 
-    `batches` are those of `task_batch`, one for each task, `vectorize` of which run at once.
-    `log_rates` are those of the `TrainingState`. Returns parameter name -> gradient, the same for
-    `log_rates`, and the mean query loss after the inner step, ().
+    `DAMIPolicy.loss` is lines 7 to 13 and 15 to 17, `maml.adapt` is line 14, and the way back is
+    `maml.meta_gradient` (line 18). `batches` has one of `task_batch` for each task; `vectorize`
+    tasks run at once. `log_rates` are those of the `TrainingState`. Returns parameter name ->
+    gradient, the same for `log_rates`, and the mean query loss after the inner step, ().
     """
     inner_lr = rate_in_training(log_rates, settings)
     gradients, rate_gradients, losses = meta_gradient(
@@ -346,7 +260,7 @@ def tasks_of_step(step: int, tasks: int, settings: Settings) -> list[int]:
 
 
 def learning_rate(step: int, settings: Settings, peak: float) -> float:
-    """Linear warm-up to the peak, then half a cosine, to zero one step after the last."""
+    """Rises linearly to the peak, then falls along half a cosine, to 0 one step after the last."""
     if step < settings.warmup:
         return peak * (step + 1) / settings.warmup
     done, steps = step - settings.warmup, max(1, settings.steps - settings.warmup)
@@ -366,9 +280,13 @@ class TrainingState:
     step: int = 0  # outer steps that are done
     seconds: float = 0.0  # that they took
 
-    def inner_rates(self) -> dict[str, float]:
-        """The learned rates of the inner step, as checkpoints keep them; empty if it is fixed."""
-        return {name: log_rate.exp().item() for name, log_rate in self.log_rates.items()}
+    def progress(self) -> dict[str, Any]:
+        """What every checkpoint says of the training so far; rates only where they are learned."""
+        return {
+            "step": self.step,
+            "seconds": self.seconds,
+            "inner_rates": {name: rate.exp().item() for name, rate in self.log_rates.items()},
+        }
 
 
 def start_training(
@@ -377,7 +295,10 @@ def start_training(
     samplers: dict[str, WindowSampler],
     device: str | torch.device = "cpu",
 ) -> TrainingState:
-    """Returns a fresh policy, normalized to the data of all tasks (line 1), its average, AdamW."""
+    """Line 1: fresh weights, their average, and AdamW.
+
+    The normalizer, which Algorithm 1 leaves out, is fitted to the data of all tasks.
+    """
     torch.manual_seed(settings.seed)
     policy = model.build_policy(config).to(device)
     policy.normalizer.fit(samplers.values())
@@ -413,8 +334,9 @@ def meta_train(
 
     Yields:
         Figures of each outer step: loss, gradient_norm and lr. Where there is an inner step, loss
-        is the query loss after it; every tenth such step has the query loss before it as well,
-        loss_before. Where rates of the inner step are learned, inner_lr is their geometric mean.
+        is the query loss after it, and every tenth step (0, 10, 20 ...) has the query loss before
+        it as well, loss_before. Where rates of the inner step are learned, inner_lr is their
+        geometric mean.
 
     Raises:
         UserError: the loss or its gradient is not finite. The step changed nothing then.
@@ -422,8 +344,8 @@ def meta_train(
     policy = state.policy
     all_tasks = list(samplers)
 
-    # Where all demonstrations have one length several tasks can run at once. As the shapes are the
-    # same in every step then, on a GPU either kind of step can also be one CUDA graph.
+    # If all episodes have the same length, batches of several tasks can be stacked. Their shapes
+    # then never change, so that, on a GPU, either kind of step can be one CUDA graph.
     lengths = {e.stop - e.start for sampler in samplers.values() for e in sampler.episodes}
     vectorize = settings.vectorize if len(lengths) == 1 else 1
     without_inner_step = partial(multi_task_gradient, policy, bfloat16=settings.bfloat16)
@@ -436,10 +358,10 @@ def meta_train(
 
     for step in range(state.step, settings.steps):  # lines 2, 22
         inner = step >= settings.pretrain_steps
-        task_numbers = tasks_of_step(step, len(all_tasks), settings)
+        task_numbers = tasks_of_step(step, len(all_tasks), settings)  # line 3
         my_task_numbers = task_numbers[rank::world]
-        batches = []
-        for i in my_task_numbers:  # lines 3 to 6, 9
+        batches = []  # all are drawn first, then `vectorize` tasks at a time are adapted
+        for i in my_task_numbers:  # lines 4 to 6, 9
             task = all_tasks[i]
             batch = task_batch(
                 policy,
@@ -453,19 +375,19 @@ def meta_train(
             batches.append(batch)
 
         # The gradient of the mean loss over my tasks
-        log_rate_gradients = {}
         if inner:
-            gradients, log_rate_gradients, loss = through_inner_step(batches)  # lines 4 to 19
-            figures = {"loss": loss}
-            if step % LOSS_BEFORE_EVERY == 0:
-                queries = [split(batch, settings.support)[1] for batch in batches]
-                with torch.no_grad():
-                    figures["loss_before"] = multi_task_loss(policy, queries)
+            gradients, log_rate_gradients, loss = through_inner_step(batches)  # lines 7 to 19
         else:
             gradients, loss = without_inner_step(batches)
-            figures = {"loss": loss}
+            log_rate_gradients = {}
+        figures = {"loss": loss}
+        if inner and step % LOSS_BEFORE_EVERY == 0:
+            queries = [split(batch, settings.support)[1] for batch in batches]
+            with torch.no_grad():
+                figures["loss_before"] = multi_task_loss(policy, queries)
 
-        # The mean over all tasks: that of the processes' means, weighted by their numbers of tasks
+        # Each process has the mean over its own tasks. Weighted by how many those are, they add up
+        # to the mean over all.
         if world > 1:
             for x in (*figures.values(), *gradients.values(), *log_rate_gradients.values()):
                 dist.all_reduce(x.mul_(len(my_task_numbers) / len(task_numbers)))
@@ -504,26 +426,32 @@ SAVE_SHARE = 0.04
 
 # These may differ when a run is resumed. Only `vectorize` changes weights, in their last bits.
 FREE_TO_CHANGE = ("vectorize", "checkpoint_every", "evaluate_every", "episodes")
-# These may differ as long as there was no inner step.
+# These, too, may differ while no inner step has been taken.
 OF_INNER_STEP = ("maml", "inner_lr", "learn_inner_lr", "rate_lr", "task_dropout")
+# These follow from the recordings, which are compared by themselves.
+OF_RECORDINGS = ("point_dim", "state_dim", "action_dim", "demo_positions")
+
+
+def is_due(step: int, every: int, settings: Settings) -> bool:
+    """Whether what is done every so many steps, and after the last one, is done after this step."""
+    return step == settings.steps or step % every == 0
 
 
 def is_milestone(step: int, settings: Settings) -> bool:
     """Whether the moving average is kept after this step."""
     every = (settings.checkpoint_every, settings.evaluate_every)
-    return step == settings.steps or any(step % n == 0 for n in every)
+    return any(is_due(step, n, settings) for n in every)
+
+
+def checkpoint_after(step: int, folder: Path) -> Path:
+    """The file in a run's folder that holds the moving average after a step."""
+    return folder / f"ema-{step:05d}.pt"
 
 
 def save_average(folder: Path, state: TrainingState, info: dict[str, Any]) -> None:
     """Writes the moving average, and `info`, to the checkpoint of this step."""
-    model.save(
-        folder / f"ema-{state.step:05d}.pt",
-        state.average.module,
-        step=state.step,
-        seconds=state.seconds,
-        inner_rates=state.inner_rates(),
-        **info,
-    )
+    path = checkpoint_after(state.step, folder)
+    model.save(path, state.average.module, **state.progress(), **info)
 
 
 class Saver:
@@ -532,11 +460,11 @@ class Saver:
     def __init__(self, path: Path, info: dict[str, Any]) -> None:
         self.path = path
         self.info = info
-        self.ended = time.monotonic()
+        self.last_saved = time.monotonic()  # or when the run began
         self.took = 0.0  # seconds
 
     def is_due(self) -> bool:
-        waited = time.monotonic() - self.ended
+        waited = time.monotonic() - self.last_saved
         return waited > max(SAVE_SECONDS, self.took / SAVE_SHARE)
 
     def save(self, state: TrainingState) -> None:
@@ -547,25 +475,16 @@ class Saver:
             "n_averaged": state.average.n_averaged,
             "log_rates": state.log_rates,
         }
-        model.save(
-            self.path,
-            state.average.module,
-            training=training,
-            step=state.step,
-            seconds=state.seconds,
-            inner_rates=state.inner_rates(),
-            **self.info,
-        )
-        self.ended = time.monotonic()
-        self.took = self.ended - began
+        average = state.average.module
+        model.save(self.path, average, training=training, **state.progress(), **self.info)
+        self.last_saved = time.monotonic()
+        self.took = self.last_saved - began
 
 
-def restore(
-    path: Path, state: TrainingState, settings: Settings, recordings: str
-) -> dict[str, Any]:
+def restore(path: Path, state: TrainingState, settings: Settings, digest: str) -> dict[str, Any]:
     """Brings a fresh state to where last.pt left it; returns what else that file says.
 
-    `recordings` is the `fingerprint` of what is trained on. Raises UserError for a run that was
+    `digest` is the `fingerprint` of what is trained on. Raises UserError for a run that was
     started with other settings, or on other recordings.
     """
     policy, config = state.policy, state.policy.config
@@ -579,27 +498,27 @@ def restore(
         settings_then = Settings(**info["arguments"])  # newer fields take their defaults
     except TypeError as error:
         raise UserError(f"{path} is of another version of the code: {error}") from error
-    may_differ = set(FREE_TO_CHANGE)
+    may_differ = {*FREE_TO_CHANGE, *OF_RECORDINGS}
     if info["step"] <= min(settings.pretrain_steps, settings_then.pretrain_steps):
         may_differ.update(OF_INNER_STEP)
-    changed = []
+    differences = []
     for now, then in ((settings, settings_then), (config, averaged.config)):
         for name, value in asdict(now).items():
             if getattr(then, name) != value and name not in may_differ:
-                changed.append(f"{name} {getattr(then, name)} -> {value}")
-    if changed:
+                differences.append(f"{name} {getattr(then, name)} -> {value}")
+    if differences:
         raise UserError(
-            f"{path.parent} was started with other settings ({', '.join(changed)}): "
+            f"{path.parent} was started with other settings ({', '.join(differences)}): "
             "give the old ones to resume it"
         )
-    if info["recordings"] != recordings:
+    if info["recordings"] != digest:
         raise UserError(f"{path.parent} was started on other recordings: bring those back")
 
     policy.load_state_dict(info["training"]["policy"])
     state.average.module.load_state_dict(averaged.state_dict())
     state.average.n_averaged.copy_(info["training"]["n_averaged"])
-    # AdamW's second group, that of the inner rates, stays as it was just set up: a run that had no
-    # inner step so far may begin to learn them now.
+    # The group of the inner rates keeps its new settings: they may have been turned on, or changed,
+    # before the first inner step.
     optimizer_state = info["training"]["optimizer"]
     optimizer_state["param_groups"][1:] = state.optimizer.state_dict()["param_groups"][1:]
     state.optimizer.load_state_dict(optimizer_state)
@@ -644,11 +563,17 @@ class Evaluation:
     device: torch.device
 
     def roll_out(
-        self, checkpoint: Path, recordings: dict[str, Path] | None = None, **options: Any
+        self,
+        checkpoint: Path,
+        *,
+        recordings: dict[str, Path] | None = None,
+        demonstration_control: str | None = None,
+        inner_steps: int = 0,
+        pool: WorkerPool | None = None,
     ) -> Outcomes:
         """Rolls a checkpoint out, with the demonstrations of `recordings` or of the tasks' own.
 
-        `options` are further ones of `evaluate.evaluate_checkpoint`.
+        The other arguments are those of `evaluate.evaluate_checkpoint`.
         """
         return evaluate.evaluate_checkpoint(
             checkpoint=checkpoint,
@@ -660,7 +585,9 @@ class Evaluation:
             workers=self.workers,
             device=self.device,
             n_demonstrations=self.n_demonstrations,
-            **options,
+            demonstration_control=demonstration_control,
+            inner_steps=inner_steps,
+            pool=pool,
         )
 
     def run(self, step: int, stop: StopRequest) -> Outcomes | None:
@@ -669,7 +596,7 @@ class Evaluation:
         Returns None if no evaluation is due. Ctrl-C stops it at once, since the run is saved.
         """
         settings = self.settings
-        due = step == settings.steps or (step > 0 and step % settings.evaluate_every == 0)
+        due = is_due(step, settings.evaluate_every, settings)
         if self.simulator is None or settings.episodes == 0 or not due:
             return None
         for line in read_json_lines(self.folder / "metrics.jsonl"):
@@ -681,7 +608,7 @@ class Evaluation:
                     return logged  # otherwise --episodes was another then
         try:
             with stop.suspended():
-                outcomes = self.roll_out(self.folder / f"ema-{step:05d}.pt")
+                outcomes = self.roll_out(checkpoint_after(step, self.folder))
         except KeyboardInterrupt:
             raise KeyboardInterrupt("all is saved, add --resume to go on") from None
         append_json(
@@ -700,29 +627,37 @@ class Evaluation:
     ) -> dict[str, Outcomes]:
         """What demonstration and inner step contribute to success on the tasks that are measured.
 
-        Title -> outcomes of the last checkpoint: with each task's own demonstration (`own`, which
-        is measured already), with that of another task, and without any; then the same after an
-        inner step, if there was any in training. That step is taken on windows of the task whose
-        demonstration is shown. Also animates the first two tasks, from one seed.
+        Title -> outcomes of the last checkpoint, which is shown
+        - each task's own demonstration (`own`, which is measured already),
+        - that of another task,
+        - and zeros in place of a demonstration.
+        If training had inner steps, all three again after one, on windows of the task whose
+        demonstration is read. It also animates the first two tasks, from one seed.
         """
         settings = self.settings
-        checkpoint = self.folder / f"ema-{settings.steps:05d}.pt"
+        checkpoint = checkpoint_after(settings.steps, self.folder)
         own_title = "own demonstration" if reads_demonstration else "no demonstration"
-        others: dict[str, dict[str, Any]] = {}
+        # Title -> whose demonstrations are read, and the control of `evaluate.controlled`
+        inputs: dict[str, tuple[dict[str, Path], str | None]] = {own_title: (self.recordings, None)}
         if reads_demonstration and len(self.recordings) > 1:
-            others["another task's"] = {"recordings": evaluate.of_next_task(self.recordings)}
+            inputs["another task's"] = (evaluate.of_next_task(self.recordings), None)
         if reads_demonstration:
-            others["none"] = {"demonstration_control": "zeros"}
+            inputs["none"] = (self.recordings, "zeros")
+        has_inner_step = settings.pretrain_steps < settings.steps
         columns = {own_title: own}
         try:
             with stop.suspended(), WorkerPool(self.workers) as pool:
-                roll_out = partial(self.roll_out, checkpoint, pool=pool)
-                for title, options in others.items():
-                    columns[title] = roll_out(**options)
-                if settings.pretrain_steps < settings.steps:
-                    for title, options in {own_title: {}, **others}.items():
-                        after = roll_out(**options, inner_steps=1)
-                        columns[f"{title}, after an inner step"] = after
+                for inner_steps in (0, 1) if has_inner_step else (0,):
+                    for title, (recordings, control) in inputs.items():
+                        label = f"{title}, after an inner step" if inner_steps else title
+                        if label not in columns:
+                            columns[label] = self.roll_out(
+                                checkpoint,
+                                recordings=recordings,
+                                demonstration_control=control,
+                                inner_steps=inner_steps,
+                                pool=pool,
+                            )
             with stop.suspended():
                 self.animate(checkpoint)
         except KeyboardInterrupt:
@@ -806,8 +741,9 @@ def heldout_controls(
     settings: Settings,
     inner_lr: InnerRate,
 ) -> dict[str, np.ndarray]:
-    """Whether a policy reads its demonstration, and what an inner step does, where nothing can be
-    rolled out: title -> errors (A,) on held-out episodes, as means over tasks.
+    """Held-out errors (A,) by title, means over tasks: with wrong demonstrations, and after steps.
+
+    They stand in for the rollouts of `Evaluation.contributions` where nothing can be rolled out.
     """
     measure = partial(evaluate.evaluate_heldout, policy, train_samplers, heldout_samplers, text)
     rows = {}
@@ -829,7 +765,7 @@ def heldout_controls(
             steps=5,
             batch=settings.support,
             lr=inner_lr,
-            seed=zlib.crc32(task.encode()),  # each task has draws of its own
+            seed=evaluate.inner_seed(settings.seed, task),
         )
         try:
             for step, _, adapted in of_each_step:
@@ -838,7 +774,7 @@ def heldout_controls(
                         adapted, sampler, heldout_sampler, text[task]
                     )
         except UserError as error:  # of five steps, where training took one
-            print(f"inner steps were given up, {error}", flush=True)
+            print(f"inner steps on held-out episodes were not measured: {error}", flush=True)
     for step, of_tasks in measured.items():
         if len(of_tasks) == len(heldout_samplers):
             rows[f"after {common.count(step, 'inner step')}"] = mean_of_tasks(of_tasks)
@@ -848,6 +784,7 @@ def heldout_controls(
 def report_training(
     folder: Path,
     settings: Settings,
+    simulator: Simulator | None,
     policy: str,
     seconds: float,
     provenance: dict[str, Any],
@@ -877,19 +814,106 @@ def report_training(
 
     files = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     print(f"\n{folder} is finished: {', '.join(files)}")
-    if settings.suite == "own":
+    if simulator is None:
         new = "--data NEW.npz"
-    elif simulator_of(settings.suite).tasks(settings.suite)[1]:
+    elif simulator.tasks(settings.suite)[1]:
         new = f"--task novel --suite {settings.suite}"
     else:
         return  # there are no novel tasks to adapt to
     print(f"next: python finetune.py {new} --checkpoint {shlex.quote(str(folder))}")
 
 
+# ---- Presets, and what suites change -------------------------------------------------------------
+
+# What a preset changes; the architecture of the same name is in baselines.PRESETS.
+# fmt: off
+SETTINGS = {
+    "paper": Settings(),
+    "small": Settings(
+        preset="small", steps=8_000, support=4, query=12, lr=1e-3, warmup=100,
+        pretrain_fraction=0.9,  # a step without an inner step takes a third of the time
+        after_success=20,  # three fifths of the experts' frames are later ...
+        late_fraction=0.15,  # ... and show how to stay; many of them cost success elsewhere
+        instruction_dropout=0.2,  # otherwise the policy ignores the demonstration
+        task_dropout=0.25, inner_lr=3e-3,  # without task inputs the inner step must find the task
+        vectorize=10, augment=True, checkpoint_every=1_000, evaluate_every=8_000,
+    ),
+    "tiny": Settings(
+        preset="tiny", steps=30, support=4, query=8, inner_lr=1e-3, lr=3e-3, warmup=5, vectorize=10,
+        after_success=20, demonstrations=2, checkpoint_every=15, evaluate_every=30, episodes=2,
+    ),
+}
+# fmt: on
+
+
+# What a suite of hidden goals changes, in every preset. The instruction tells nothing, and need
+# not be left out for the demonstration to be read. One map moves all scenes of a task, which makes
+# new goals; a map of each scene's own would hide the goal. What was learned is measured on novel
+# goals, without adapting to them.
+HIDDEN_GOALS = {
+    "base_tasks": 160,
+    "demonstrations": 3,  # one to read, one for the support windows, one for the query windows
+    "tasks_per_step": 16,
+    "augment": True,
+    "one_map": True,
+    "instruction_dropout": 0.0,
+    "task_dropout": 0.0,
+    "after_success": None,  # episodes are short, and end soon after their success
+    "late_fraction": 0.0,
+    "evaluate_on": "novel",
+    "episodes": 2,
+}
+# What it changes besides in `small`: many goals a step, and few windows of each. At the learning
+# rate of other suites, 1e-3, one of two trainings got stuck at a loss at which the goal is read
+# only in part. Where the hand has to find the puck first, more steps are needed.
+HIDDEN_GOALS_SMALL = {
+    "lr": 5e-4,
+    "tasks_per_step": 40,
+    "support": 1,
+    "query": 1,
+    "pretrain_fraction": 0.97,
+    "checkpoint_every": 500,
+    "evaluate_every": 3_000,
+}
+HIDDEN_GOALS_STEPS = {"reach": 1_500, "push": 3_000, "pick-place": 3_000}  # of `small`
+
+# What pairs change. The instruction does not tell the task, so leaving it out teaches nothing.
+PAIRS = {"instruction_dropout": 0.0, "after_success": None, "late_fraction": 0.0}
+
+# What turned actions change. Augmentation also stretches scenes, and so would change the angle.
+CONVENTION = {
+    "demonstrations": 8,
+    "augment": False,
+    "instruction_dropout": 0.0,
+    "after_success": None,  # episodes are short, and end soon after their success
+    "late_fraction": 0.0,
+    "evaluate_on": "novel",
+    "episodes": 5,
+}
+SUITE_SETTINGS = {
+    "goals-reach": HIDDEN_GOALS,
+    "goals-push": HIDDEN_GOALS,
+    "goals-pick-place": HIDDEN_GOALS,
+    "pairs": PAIRS,
+    "convention-reach": CONVENTION,
+    "convention-push": CONVENTION,
+}
+
+
+def preset_settings(preset: str, suite: str) -> Settings:
+    """A preset's settings on a suite; goals-reach-validation has those of goals-reach."""
+    name = suite.removesuffix("-validation")
+    changes = dict(SUITE_SETTINGS.get(name, {}))
+    if preset == "small" and name.startswith("goals-"):
+        steps = HIDDEN_GOALS_STEPS[name.removeprefix("goals-")]
+        changes.update(HIDDEN_GOALS_SMALL, steps=steps)
+    return replace(SETTINGS[preset], suite=suite, **changes)
+
+
 # ---- From the command line to a run --------------------------------------------------------------
 
-# An own demonstration may have so many frames, or as many as the longest of its recordings; 500 is
-# the paper's number on a real robot.
+# A policy for own recordings can read demonstrations of up to 500 frames, the paper's number on a
+# real robot, or as long as the longest of the recordings.
 OWN_FRAMES = 500
 # The fields of PolicyConfig that are flags
 ARCHITECTURE = ("policy", "demo_encoder", "denoiser", "tcfm", "sampler", "num_points")
@@ -907,7 +931,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     group.add_argument("--data", help="folder of the demonstrations (default: data)")
     group.add_argument(
         "--out",
-        help="folder of the run (default: runs/SUITE-PRESET-seedSEED; own: own-DATA for SUITE)",
+        help="folder of the run (default: runs/SUITE-PRESET-seedSEED, with --policy "
+        "runs/SUITE-POLICY-PRESET-seedSEED; for own recordings SUITE is own-DATA)",
     )
     group.add_argument("--resume", action="store_true", help="go on from the run's last.pt")
     common.add_common_flags(group)
@@ -923,7 +948,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
             help="see model.PolicyConfig" + common.describe_presets(values),
         )
     group = parser.add_argument_group(
-        "settings", "Default: the preset's. Suites whose tasks no observation names change some."
+        "settings", "Default: the preset's. goals-*, pairs and convention-* change some of them."
     )
     common.add_settings(group, Settings, SETTINGS)
     return parser.parse_args(argv)
@@ -979,7 +1004,8 @@ def fit_to_recordings(
         config: the architecture otherwise.
         recordings: one of each task.
         longest: there are learned positions for at least so many frames, before the stride.
-        fewer_points: if a recording has fewer points than `config` asks for, take its number.
+        fewer_points: where `config` asks for more points than a recording has, take the smallest
+            number of points of all recordings.
     """
     first, num_points = recordings[0], config.num_points
     if fewer_points:
@@ -997,7 +1023,7 @@ def fit_to_recordings(
     )
 
 
-def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int, int]:
+def join_processes(device: torch.device, tasks_per_step: int) -> tuple[torch.device, int, int]:
     """Joins the processes of torchrun, which share the tasks; returns (device, rank, how many).
 
     Rank 0 collects, logs, saves and evaluates, while the others wait for it.
@@ -1005,8 +1031,10 @@ def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int,
     world = int(os.environ.get("WORLD_SIZE", 1))
     if world == 1:
         return device, 0, 1
-    if world > tasks:
-        raise UserError(f"{world} processes for {tasks} tasks: use at most one a task")
+    if world > tasks_per_step:
+        raise UserError(
+            f"{world} processes for {tasks_per_step} tasks a step: use at most one process a task"
+        )
     if "RANK" not in os.environ:
         raise UserError("WORLD_SIZE is set and RANK is not: start with torchrun, or unset it")
     if device.type == "cuda" and device.index is None:
@@ -1017,12 +1045,33 @@ def join_processes(device: torch.device, tasks: int) -> tuple[torch.device, int,
     return device, int(os.environ["RANK"]), world
 
 
+def check_same_weights(identity: str, world: int) -> None:
+    """Raises UserError if the processes of torchrun have different CLIP weights."""
+    identities: list[Any] = [None] * world
+    dist.all_gather_object(identities, identity)
+    if len(set(identities)) > 1:
+        raise UserError(
+            f"processes have different text weights ({', '.join(identities)}): name one file for "
+            "all by --clip-weights"
+        )
+
+
 def check_folder(folder: Path, resume: bool) -> None:
-    """Raises UserError for a run that cannot be resumed, or that a new one would overwrite."""
-    if resume and not (folder / "last.pt").exists():
-        raise UserError(f"there is no run to resume in {folder}: look at --out")
-    if not resume and any(folder.glob("*.pt")):
+    """Raises UserError for a run that cannot be resumed, or what a new one would overwrite."""
+    if resume:
+        if not (folder / "last.pt").exists():
+            raise UserError(f"there is no run to resume in {folder}: look at --out")
+        return
+    if any(folder.glob("*.pt")):
         raise UserError(f"{folder} already holds a run: add --resume, or another --out")
+    # A run that was killed before it saved leaves config.json and metrics.jsonl, and may begin anew
+    arguments = {}
+    with suppress(OSError, ValueError, KeyError, TypeError):  # no file, or not one of train.py
+        arguments = json.loads((folder / "config.json").read_text())["arguments"]
+    files = {"success.json"} if arguments else {"success.json", "config.json", "metrics.jsonl"}
+    for name in sorted(files):
+        if (folder / name).exists():
+            raise UserError(f"{folder} already holds {name} of something else: use another --out")
 
 
 def any_process(flag: bool, device: torch.device) -> bool:
@@ -1052,7 +1101,7 @@ def begin_files(
     write_text(folder / "config.json", json.dumps(content, indent=1))
 
     path = folder / "metrics.jsonl"
-    kept = [line for line in read_json_lines(path) if 0 < line["step"] <= step]
+    kept = [line for line in read_json_lines(path) if line.get("step", 0) <= step] if step else []
     write_text(path, "".join(f"{json.dumps(line)}\n" for line in kept))
 
 
@@ -1118,20 +1167,26 @@ def run(
         fewer_points=args.num_points is None,
     )
     train_samplers, heldout_samplers = make_samplers(recordings, config, settings)
-    data = fingerprint(train_samplers)
+    digest = fingerprint(train_samplers)
 
     # The policy, fresh or as it was left
     state = start_training(config, settings, train_samplers, device)
     text_weights = None  # any
     if args.resume:
-        saved = restore(folder / "last.pt", state, settings, data)
+        saved = restore(folder / "last.pt", state, settings, digest)
         text_weights, provenance = saved["text_weights"], saved["provenance"]
     instructions = {task: recording.instruction for task, recording in recordings.items()}
     for task, path in evaluated_paths.items():
         instructions.setdefault(task, load_demonstrations(path).instruction)
+    if rank > 0:
+        dist.barrier()  # rank 0 downloads CLIP's weights, if they are not there
     text, text_weights = evaluate.instruction_features(
         instructions, weights=args.clip_weights, identity=text_weights, device=device
     )
+    if world > 1:
+        if rank == 0:
+            dist.barrier()
+        check_same_weights(text_weights, world)
     provenance = {"text weights": text_weights, **provenance}
 
     n_demonstrations = None
@@ -1148,7 +1203,7 @@ def run(
         "text_weights": text_weights,
         "provenance": provenance,
     }
-    saver = Saver(folder / "last.pt", info={**checkpoint_info, "recordings": data})
+    saver = Saver(folder / "last.pt", info={**checkpoint_info, "recordings": digest})
     evaluation = Evaluation(
         folder=folder,
         settings=settings,
@@ -1168,8 +1223,8 @@ def run(
     outcomes = None
     with StopRequest() as stop, bar:
         if rank == 0 and state.step > 0:
-            last_checkpoint = folder / f"ema-{state.step:05d}.pt"
-            if is_milestone(state.step, settings) and not last_checkpoint.exists():
+            checkpoint = checkpoint_after(state.step, folder)
+            if is_milestone(state.step, settings) and not checkpoint.exists():
                 # Missing where --checkpoint-every or --evaluate-every changed on --resume
                 save_average(folder, state, checkpoint_info)
             outcomes = evaluation.run(state.step, stop)  # the run may have been stopped during it
@@ -1212,7 +1267,9 @@ def run(
         elif outcomes is not None:
             columns = {"last checkpoint": outcomes}
     if rank == 0:
-        report_training(folder, settings, config.policy, state.seconds, provenance, columns)
+        report_training(
+            folder, settings, simulator, config.policy, state.seconds, provenance, columns
+        )
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -1221,6 +1278,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     default = "paper" if device.type == "cuda" else "small"
     preset = choose(args.preset or default, SETTINGS, "preset")
     own = args.data is not None and args.suite is None
+    for flag in ("episodes", "evaluate_on"):
+        if own and getattr(args, flag):
+            raise UserError(
+                f"{common.flag_name(flag)}: own recordings have no simulator to be rolled out in; "
+                "--held-out keeps episodes to measure by"
+            )
     suite = "own" if own else args.suite or "ml10"
     config = choose_architecture(args, preset)
 
@@ -1246,8 +1309,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     trained_on = suite if simulator else f"own-{Path(args.data).resolve().name}"
     folder = Path(args.out or f"runs/{trained_on}-{name}-seed{settings.seed}")
 
-    tasks_per_step = min(len(paths), settings.tasks_per_step or len(paths))
-    device, rank, world = join_processes(device, tasks=tasks_per_step)
+    tasks_per_step = len(tasks_of_step(0, len(paths), settings))
+    device, rank, world = join_processes(device, tasks_per_step)
     with common.locked(folder) if rank == 0 else nullcontext():
         if rank == 0:
             where = f"{device} ({common.hardware(device)})"

@@ -487,6 +487,23 @@ def test_resuming_several_tasks_removes_no_policy_of_one(run, recorded, capsys):
     assert "measured holds other results" in fails(finetune, several, capsys)
     assert Path("measured/success.json").exists()
 
+    # Nor a file of that name that is the user's own
+    for folder in (Path("project"), Path("project/door-close")):
+        folder.mkdir()
+        (folder / "config.json").write_text('{"mine": 1}')
+        several = adapting(run, recorded, "--episodes 0 --out project --resume", "door-close reach")
+        assert f"{folder} holds other results" in fails(finetune, several, capsys)
+        (folder / "config.json").unlink()
+
+    # Nor a policy that was adapted otherwise and not rolled out
+    argv = adapting(run, recorded, "--episodes 0 --out both", "door-close reach")
+    finetune.main(argv)
+    before = fingerprint(Path("both"))
+    message = fails(finetune, [*argv, "--resume", "--batch", "3"], capsys)
+    assert "both/door-close was made with another batch" in message
+    finetune.main([*argv, "--resume"])  # nothing is left to do
+    assert fingerprint(Path("both")) == before
+
 
 def test_a_folder_in_use_is_not_written_into(run, recorded, capsys):
     with common.locked(Path("busy")):

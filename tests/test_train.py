@@ -864,7 +864,7 @@ def edit_last(folder, **arguments):
 
 def test_what_changes_no_number_may_differ_when_a_run_is_resumed(resumable, tmp_path):
     """Out of memory the advice is a smaller --vectorize: resuming must accept it."""
-    others = "--vectorize 1 --checkpoint-every 2 --evaluate-every 4 --episodes 7".split()
+    others = "--vectorize 1 --checkpoint-every 2 --evaluate-every 4 --episodes 0".split()
     train.main([*resumable, *others])
     written = json.loads((tmp_path / "run" / "config.json").read_text())
     assert written["arguments"]["vectorize"] == 1
@@ -909,6 +909,38 @@ def test_an_existing_run_is_neither_overwritten_nor_resumed_with_other_settings(
     assert fingerprint(finished) == before
 
 
+def test_a_new_run_overwrites_nothing_that_it_did_not_write(pair, capsys):
+    argv = [*SHORT, "--data", str(pair), "--out", "notes"]
+    Path("notes").mkdir()
+    for name, text in (("config.json", "[1]"), ("metrics.jsonl", "{}\n"), ("success.json", "{}")):
+        Path("notes", name).write_text(text)
+        assert f"notes already holds {name} of something else" in fails(train, argv, capsys)
+        assert Path("notes", name).read_text() == text
+        Path("notes", name).unlink()
+    train.main([*argv, "--steps", "2"])
+    for file in Path("notes").glob("*.pt"):  # as if it had been killed before it saved
+        file.unlink()
+    train.main([*argv, "--steps", "2"])
+
+
+def test_what_own_recordings_cannot_be_measured_by_is_refused(pair, capsys):
+    for flag in ("--episodes 5", "--evaluate-on novel"):
+        message = fails(train, [*SHORT, "--data", str(pair), *flag.split()], capsys)
+        assert f"{flag.split()[0]}: own recordings have no simulator" in message
+
+
+def test_processes_with_different_text_weights_do_not_train_together(monkeypatch):
+    def gather(identities, identity):
+        identities[:] = [identity, other]
+
+    monkeypatch.setattr(train.dist, "all_gather_object", gather)
+    other = "random-seed-0"
+    train.check_same_weights("random-seed-0", world=2)
+    other = "openai"
+    with pytest.raises(train.UserError, match=r"weights \(random-seed-0, openai\)"):
+        train.check_same_weights("random-seed-0", world=2)
+
+
 def test_a_run_is_not_resumed_on_other_recordings(tmp_path, capsys):
     folder = save_pair(tmp_path / "own")
     argv = [*SHORT, "--steps", "2", "--augment", "--data", str(folder), "--out", "run"]
@@ -919,6 +951,9 @@ def test_a_run_is_not_resumed_on_other_recordings(tmp_path, capsys):
         data.save_demonstrations(folder / "pour.npz", replace(recording, **change))
         message = fails(train, [*argv, "--resume"], capsys)
         assert "was started on other recordings" in message
+    longer = own_recording(720, ends=[700, 720], task="pour")  # beyond the learned positions
+    save_recording(folder, longer)
+    assert "was started on other recordings" in fails(train, [*argv, "--resume"], capsys)
 
 
 def test_what_cannot_be_resumed_is_said(pair, finished, tmp_path, capsys):
@@ -1122,7 +1157,9 @@ def test_torchruns_variables_alone_end_in_one_line(pair, monkeypatch, capsys):
     assert "RANK is not" in fails(train, argv, capsys)
     monkeypatch.setenv("WORLD_SIZE", "3")
     monkeypatch.setenv("RANK", "0")
-    assert "3 processes for 2 tasks: use at most one a task" in fails(train, argv, capsys)
+    assert "3 processes for 2 tasks a step: use at most one process a task" in fails(
+        train, argv, capsys
+    )
 
 
 def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_last_good_state(
