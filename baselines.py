@@ -41,6 +41,7 @@ from model import (
     POLICIES,
     Attention,
     ConditionalUNet1d,
+    ConfigError,
     Context,
     DP3Policy,
     PolicyConfig,
@@ -445,9 +446,9 @@ class FrequencyTransformer(nn.Module):
     def __init__(self, config: PolicyConfig):
         super().__init__()
         if config.policy != "freq":
-            raise ValueError(f"frequency-transformer is the denoiser of freq, not {config.policy}")
+            raise ConfigError(f"frequency-transformer is the denoiser of freq, not {config.policy}")
         if len(config.unet_widths) != 2:
-            raise ValueError(f"freq takes two widths, Transformer and head: {config.unet_widths}")
+            raise ConfigError(f"freq takes two widths, Transformer and head: {config.unet_widths}")
         H, W, prefix = config.horizon, config.unet_widths[0], config.n_obs_steps + 1
         self.register_buffer("dct", dct_matrix(H).float(), persistent=False)
         self.project_observation = nn.Linear(config.observation_feature_dim, W)

@@ -269,9 +269,10 @@ class RayCastCamera:
         # A ray that meets the box enters each of its three slabs before it leaves any.
         with np.errstate(divide="ignore", invalid="ignore"):
             first, second = (self.low - origin) / rays, (self.high - origin) / rays
-        enter = np.minimum(first, second).max(axis=1)  # (H * W,) metres
-        leave = np.maximum(first, second).min(axis=1)
-        rays = rays[leave > np.maximum(enter, 0)]  # (R, 3)
+        enter, leave = np.minimum(first, second), np.maximum(first, second)  # (H * W, 3) metres
+        in_face = np.isnan(enter)  # 0 / 0: the ray runs in a face, and is always in that slab
+        enter[in_face], leave[in_face] = -np.inf, np.inf
+        rays = rays[leave.min(axis=1) > np.maximum(enter.max(axis=1), 0)]  # (R, 3)
 
         distance, hit = self.cast(data, origin, rays, self.cloud_types)  # (R,) each
         seen = ~self.background[hit]

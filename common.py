@@ -99,8 +99,11 @@ def without_none(kind: Any) -> type:
 
 
 def describe_presets(values: dict[str, Any]) -> str:
-    """` (paper 20, small 4, tiny 4)`, or ` (20)` where all presets have the same value."""
-    if not values:
+    """` (paper 20, small 4, tiny 4)`, or ` (20)` where all presets have the same value.
+
+    Where all of them are None nothing is said here, because the help says what None means.
+    """
+    if set(values.values()) <= {None}:
         return ""
     if len(set(values.values())) == 1:
         return f" ({next(iter(values.values()))})"
@@ -319,7 +322,7 @@ def append_json(path: Path, **values: Any) -> None:
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
     """The lines of such a file, without one that a killed process did not finish.
 
-    Whoever goes on with a file after a kill writes it anew from these lines first.
+    A run that goes on rewrites the file from these lines, or the cut line would stay in the middle.
     """
     if not path.exists():
         return []
@@ -378,7 +381,7 @@ class StopRequest:
                     save()
                     raise KeyboardInterrupt("saved")
 
-    A second signal stops at once. Inside `stop.suspended()` the first one does so.
+    A second signal stops at once. Inside `stop.suspended()` the first one already does.
     """
 
     def __init__(self) -> None:
@@ -583,7 +586,7 @@ def report_progress(text: str, amount: int) -> None:
 
 
 class CUDAGraphed:
-    """A function of tensors as one CUDA graph: it is launched at once and not kernel by kernel.
+    """A function of tensors as one CUDA graph, so that its kernels are launched together.
 
     The first call clones its inputs and captures the graph on the clones. Every call copies its
     inputs into the clones, so their shapes must never change, and replays the graph. Other tensors

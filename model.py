@@ -40,12 +40,42 @@ from torch.optim.swa_utils import AveragedModel
 
 # ---- Configuration -------------------------------------------------------------------------------
 
+# The classes that a configuration can name. Each is registered below its definition, and those of
+# baselines.py when that file is imported.
+#
+# Encoders of demonstrations, by `PolicyConfig.demo_encoder`. Each is built from a PolicyConfig and
+# called as VisualMotorTrajectory is; it may return another number of tokens than there are frames,
+# up to `demo_positions`.
+demo_encoders: dict[str, type[nn.Module]] = {}
+# Networks, by `PolicyConfig.denoiser`. Each is built from a PolicyConfig and called as
+# ConditionalUNet1d is, with `fused` only where the configuration reads a task. Another network is a
+# class and a line.
+denoisers: dict[str, type[nn.Module]] = {}
+# Policies, by `PolicyConfig.policy`.
+POLICIES: dict[str, type["DAMIPolicy"]] = {}
+
+
+def choices() -> dict[str, tuple[str, ...]]:
+    """Field of `PolicyConfig` -> the names that it may hold, registered ones among them."""
+    return {
+        "policy": tuple(POLICIES),
+        "denoiser": tuple(denoisers),
+        "demo_encoder": (*demo_encoders, "none"),
+        "tcfm": ("down", "mid", "up", "none"),
+        "sampler": ("ddim", "dp3"),
+    }
+
+
+class ConfigError(ValueError):
+    """A configuration contradicts itself, or names parts that do not fit together."""
+
 
 @dataclass(frozen=True)
 class PolicyConfig:
     """The whole architecture, from which a checkpoint's policy is rebuilt.
 
-    The defaults are the paper's; what it leaves out (PointNet, the U-Net's widths) is DP3's.
+    The defaults are the paper's values. Where it gives none they are DP3's (PointNet, the U-Net's
+    widths, the sampler) or our own choice (`u2t_layers`).
     """
 
     policy: str = "dami"  # dami | dp3, and of baselines.py flow | mamba | freq; see `POLICIES`
@@ -86,64 +116,66 @@ class PolicyConfig:
         self.check_relations()
 
     def check_fields(self) -> None:
-        """Raises ValueError for a field whose value no policy can have."""
+        """Raises ConfigError for a field whose value no policy can have."""
         for name, known in choices().items():
             value = getattr(self, name)
             if value not in known:
-                raise ValueError(f"{name} is {value!r}; use one of {', '.join(known)}")
+                raise ConfigError(f"{name} is {value!r}; use one of {', '.join(known)}")
         for field in fields(self):
             value = getattr(self, field.name)
             numbers = value if isinstance(value, tuple) else (value,)
             if field.type is not str and not all(is_size(number) for number in numbers):
-                raise ValueError(f"{field.name} is {value!r}: use whole numbers from 1 to 100000")
+                raise ConfigError(f"{field.name} is {value!r}: use whole numbers from 1 to 100000")
             if value == ():
-                raise ValueError(f"{field.name} is (): use at least one width")
+                raise ConfigError(f"{field.name} is (): use at least one width")
         for name in ("vmt_layers", "u2t_layers"):
             if getattr(self, name) > 99:
-                raise ValueError(f"{name} is {getattr(self, name)}: use at most 99")
+                raise ConfigError(f"{name} is {getattr(self, name)}: use at most 99")
         if self.point_dim < 3:
-            raise ValueError(f"point_dim is {self.point_dim}: a position alone has 3 numbers")
+            raise ConfigError(f"point_dim is {self.point_dim}: a position alone has 3 numbers")
         if self.timestep_dim < 4 or self.timestep_dim % 2:
-            raise ValueError(f"timestep_dim is {self.timestep_dim}: use an even one, at least 4")
+            raise ConfigError(f"timestep_dim is {self.timestep_dim}: use an even one, at least 4")
         if self.kernel_size % 2 == 0:
-            raise ValueError(f"kernel_size is {self.kernel_size}: use an odd one")
+            raise ConfigError(f"kernel_size is {self.kernel_size}: use an odd one")
 
     def check_relations(self) -> None:
-        """Raises ValueError, which names both, for two fields that contradict each other."""
+        """Raises ConfigError, which names both, for two fields that contradict each other."""
         H, To, Ta = self.horizon, self.n_obs_steps, self.n_action_steps
         most = H - To + 1
         if Ta > most:
-            raise ValueError(
+            raise ConfigError(
                 f"n_action_steps is {Ta}: of horizon {H} there are {most} actions from the newest "
                 f"of n_obs_steps {To} on"
             )
-        levels = len(self.unet_widths)
-        if H % 2 ** (levels - 1):
-            raise ValueError(
-                f"horizon {H} is no multiple of {2 ** (levels - 1)}: it is halved between the "
-                f"{levels} levels of unet_widths"
-            )
-        if self.denoiser in ("unet", "mamba-unet") and self.tcfm == "up" and levels == 1:
-            raise ValueError(
-                f"tcfm is 'up', and unet_widths {self.unet_widths} have no up-sampling level"
-            )
         if self.diffusion_steps % self.inference_steps:
-            raise ValueError(
+            raise ConfigError(
                 f"diffusion_steps {self.diffusion_steps} is no multiple of "
                 f"inference_steps {self.inference_steps}"
             )
         if self.demo_dim % self.vmt_heads:
-            raise ValueError(
+            raise ConfigError(
                 f"demo_dim {self.demo_dim} is no multiple of vmt_heads {self.vmt_heads}"
             )
         if self.condition_dim % self.u2t_heads:
-            raise ValueError(
+            raise ConfigError(
                 f"the condition's width {self.condition_dim} (timestep_dim and To observation "
                 f"features) is no multiple of u2t_heads {self.u2t_heads}"
             )
+        if self.denoiser not in ("unet", "mamba-unet"):
+            return
+        levels = len(self.unet_widths)
+        if H % 2 ** (levels - 1):
+            raise ConfigError(
+                f"horizon {H} is no multiple of {2 ** (levels - 1)}: it is halved between the "
+                f"{levels} levels of unet_widths"
+            )
+        if self.tcfm == "up" and levels == 1:
+            raise ConfigError(
+                f"tcfm is 'up', and unet_widths {self.unet_widths} have no up-sampling level"
+            )
         for width in self.unet_widths:
             if width % self.n_groups:
-                raise ValueError(f"unet_widths {width} is no multiple of n_groups {self.n_groups}")
+                raise ConfigError(f"unet_widths {width} is no multiple of n_groups {self.n_groups}")
 
     @property
     def observation_feature_dim(self) -> int:
@@ -155,9 +187,13 @@ class PolicyConfig:
         return self.timestep_dim + self.n_obs_steps * self.observation_feature_dim
 
     @property
+    def reads_demonstration(self) -> bool:
+        return self.demo_encoder != "none"
+
+    @property
     def reads_task(self) -> bool:
         """Whether the policy reads an instruction or a demonstration; without, it is DP3's."""
-        return self.demo_encoder != "none" or self.tcfm != "none"
+        return self.reads_demonstration or self.tcfm != "none"
 
 
 def is_size(value: Any) -> bool:
@@ -173,7 +209,7 @@ class Attention(nn.Module):
     def __init__(self, width: int, heads: int):
         super().__init__()
         if width % heads:
-            raise ValueError(f"an attention of width {width} cannot have {heads} heads")
+            raise ConfigError(f"an attention of width {width} cannot have {heads} heads")
         self.heads = heads
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
@@ -217,8 +253,8 @@ class TransformerBlock(nn.Module):
 class PointNetEncoder(nn.Module):
     """A cloud to one feature: the same MLP on every point, the maximum over points, a projection.
 
-    The maximum makes it blind to the order of the points. A point that has the maximum in no
-    channel gets no gradient. Only the others, PointNet's critical points, are therefore
+    Only the maximum over the points is kept, so their order does not matter. Only points that have
+    the maximum in some channel, PointNet's critical points, have a gradient, so only they are
     differentiated, see `CriticalPoints`.
     """
 
@@ -236,14 +272,15 @@ class PointNetEncoder(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """(..., N, P) float, normalized -> (..., feature_dim)."""
-        if torch.is_grad_enabled():
+        if not torch.is_grad_enabled():
+            largest = self.mlp(points).amax(dim=-2)  # (..., widths[-1])
+        else:  # the same numbers, but only the critical points go through the differentiated MLP
+            # rows (R,): the critical points, as indices into all clouds' points; place (clouds,
+            # widths[-1]): for each maximum, the index of its point in `rows`
             rows, place = CriticalPoints.apply(points, *self.mlp.parameters())
-            # rows (R,): points that matter; place (clouds, widths[-1]): which one has each maximum
-            critical = points.flatten(0, -2)[rows]  # (R, P), those of all clouds
+            critical = points.flatten(0, -2)[rows]  # (R, P)
             largest = self.mlp(critical).gather(0, place)  # (clouds, widths[-1])
             largest = largest.view(*points.shape[:-2], -1)  # (..., widths[-1])
-        else:
-            largest = self.mlp(points).amax(dim=-2)  # (..., widths[-1])
         return self.projection(largest)  # (..., feature_dim)
 
 
@@ -274,42 +311,38 @@ class VisualMotorTrajectory(nn.Module):
         width = config.demo_dim
         self.projection = nn.Linear(config.observation_feature_dim + config.action_dim, width)
         self.positions = nn.Parameter(0.02 * torch.randn(config.demo_positions, width))
-        heads, layers = config.vmt_heads, config.vmt_layers
-        self.blocks = nn.ModuleList(TransformerBlock(width, heads) for _ in range(layers))
+        blocks = (TransformerBlock(width, config.vmt_heads) for _ in range(config.vmt_layers))
+        self.blocks = nn.Sequential(*blocks)
 
     def forward(self, features: Tensor, actions: Tensor) -> Tensor:
         """features (D, T, feature), actions (D, T, A) -> tokens (D, T, demo_dim)."""
         x = self.projection(torch.cat([features, actions], dim=-1))  # (D, T, demo_dim)   Eq. 4
         x = x + self.positions[: x.shape[1]]
-        for block in self.blocks:
-            x = block(x)  # Eq. 5
-        return x
+        return self.blocks(x)  # Eq. 5
 
 
-# The encoders of demonstrations by `PolicyConfig.demo_encoder`. Each is built from a PolicyConfig
-# and called as VisualMotorTrajectory is, and may return any number of tokens instead of T.
-demo_encoders: dict[str, type[nn.Module]] = {"vmt": VisualMotorTrajectory}
+demo_encoders["vmt"] = VisualMotorTrajectory
 
 
 class UnpairedUnifiedTask(nn.Module):
     """U2T: fuses demonstration, instruction and h_k, and returns h_k's token (Eqs. 6 and 8).
 
-    The sequence is [demonstration tokens | text token | h_k]. Only h_k differs from window to
-    window and from one diffusion step to the next. With one layer (the default) the keys and values
-    of the other tokens therefore belong to the task alone: `encode_context` computes them once, and
-    every window attends to the same ones. More layers mix the tokens and run on the full sequence.
+    The sequence is [demonstration tokens | text token | h_k]. The first two are the same for all
+    windows and diffusion steps of a task. With one layer (the default) their keys and values
+    therefore depend on the task alone: `encode_context` computes them once, and every window
+    attends to the same ones. More layers mix the tokens and run on the full sequence.
     """
 
     def __init__(self, config: PolicyConfig):
         super().__init__()
         demo, text, width = config.demo_dim, config.text_dim, config.condition_dim
-        if config.demo_encoder != "none":
+        if config.reads_demonstration:
             self.demo_projection = nn.Sequential(nn.LayerNorm(demo), nn.Linear(demo, width))
             self.demo_positions = nn.Parameter(0.02 * torch.randn(config.demo_positions, width))
         self.text_projection = nn.Sequential(nn.LayerNorm(text), nn.Linear(text, width))
         self.text_position = nn.Parameter(0.02 * torch.randn(1, width))
-        heads, layers = config.u2t_heads, config.u2t_layers
-        self.blocks = nn.ModuleList(TransformerBlock(width, heads) for _ in range(layers))
+        blocks = (TransformerBlock(width, config.u2t_heads) for _ in range(config.u2t_layers))
+        self.blocks = nn.Sequential(*blocks)
 
     def embed(self, demo_tokens: Tensor | None, text: Tensor) -> Tensor:
         """demo_tokens (D, T, demo_dim) or None, text (D, text_dim) -> tokens (D, T + 1, C)."""
@@ -320,7 +353,9 @@ class UnpairedUnifiedTask(nn.Module):
         return tokens
 
     def encode_context(self, demo_tokens: Tensor | None, text: Tensor) -> tuple[Tensor, ...]:
-        """What a task's windows share: keys, values (D, heads, T + 1, C / heads); or the tokens."""
+        """What the windows of D tasks share: with one layer the keys and the values of their
+        tokens, each (D, heads, T + 1, C / heads); with more, the tokens (D, T + 1, C).
+        """
         tokens = self.embed(demo_tokens, text)
         if len(self.blocks) > 1:
             return (tokens,)
@@ -335,11 +370,11 @@ class UnpairedUnifiedTask(nn.Module):
         if len(self.blocks) > 1:
             tokens = context[0].repeat_interleave(len(h) // len(context[0]), dim=0)  # (B, T + 1, C)
             x = torch.cat([tokens, h[:, None]], dim=1)  # (B, T + 2, C)
-            for block in self.blocks:
-                x = block(x)
-            return x[:, -1]
+            return self.blocks(x)[:, -1]
 
-        block, attention = self.blocks[0], self.blocks[0].attention
+        # The block's own forward, for the last token alone, with keys and values of the task shared
+        block = self.blocks[0]
+        attention = block.attention
         keys, values = context  # (D, heads, T + 1, d), with d = C / heads
         x = h.unflatten(0, (len(keys), -1))  # (D, G, C): the windows of a task, beside each other
         q, own_key, own_value = attention.project(block.norm1(x))  # (D, heads, G, d)
@@ -400,8 +435,8 @@ class ConditionEncoder(nn.Module):
         self.timestep_mlp = nn.Sequential(
             nn.Linear(width, 4 * width), Mish(), nn.Linear(4 * width, width)
         )
-        # Made in any case, and used where a task is read. Not to make it would change what a seed
-        # draws for the weights that follow, and with them the policies that were published.
+        # It is built even where it is not used: building it draws random numbers, without which a
+        # seed would give all later layers other weights than the published policies began with.
         condition_mlp = nn.Sequential(nn.Linear(C, C), Mish(), nn.Linear(C, C))
         self.condition_mlp = condition_mlp if config.reads_task else nn.Identity()
 
@@ -413,7 +448,10 @@ class ConditionEncoder(nn.Module):
 
 
 class ConvBlock(nn.Sequential):
-    """Conv1d, GroupNorm, Mish."""
+    """Conv1d, GroupNorm, Mish: PyTorch's layers, written out for speed at the end of this file.
+
+    Their Conv1d pads, so that the length L stays.
+    """
 
     def __init__(self, d_in: int, d_out: int, kernel_size: int, n_groups: int):
         super().__init__(Conv1d(d_in, d_out, kernel_size), GroupNorm(n_groups, d_out), Mish())
@@ -492,10 +530,7 @@ class ConditionalUNet1d(nn.Module):
         return self.head(x).transpose(1, 2)  # (B, H, A)
 
 
-# The networks by `PolicyConfig.denoiser`. Each is built from a PolicyConfig and called as
-# ConditionalUNet1d is, with `fused` only where the configuration reads a task. Another network is a
-# class and a line here.
-denoisers: dict[str, type[nn.Module]] = {"unet": ConditionalUNet1d}
+denoisers["unet"] = ConditionalUNet1d
 
 
 # ---- Diffusion and normalization -----------------------------------------------------------------
@@ -507,15 +542,13 @@ class DiffusionSchedule(nn.Module):
     Betas follow the squared-cosine schedule of improved DDPM, capped at 0.999.
     """
 
-    def __init__(
-        self, diffusion_steps: int = 100, inference_steps: int = 10, sampler: str = "ddim"
-    ):
+    def __init__(self, diffusion_steps: int = 100, inference_steps: int = 10, sampler: str = "dp3"):
         super().__init__()
         self.sampler = sampler
-        self.diffusion_steps, self.inference_steps = diffusion_steps, inference_steps
+        self.stride = diffusion_steps // inference_steps
         t = torch.arange(diffusion_steps + 1, dtype=torch.float64) / diffusion_steps
-        level = torch.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2  # the ideal cumulative product
-        betas = (1 - level[1:] / level[:-1]).clamp(max=0.999)
+        ideal_products = torch.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2
+        betas = (1 - ideal_products[1:] / ideal_products[:-1]).clamp(max=0.999)
         products = (1 - betas).cumprod(0).float()  # (K,), not saved: they follow from the steps
         self.register_buffer("alphas_cumprod", products, persistent=False)
 
@@ -526,20 +559,17 @@ class DiffusionSchedule(nn.Module):
 
     def timesteps(self) -> list[int]:
         """The diffusion steps that sampling visits, from noisy to clean: 90, 80, ..., 0."""
-        stride = self.diffusion_steps // self.inference_steps
-        return list(range(0, self.diffusion_steps, stride))[::-1]
+        return list(range(0, len(self.alphas_cumprod), self.stride))[::-1]
 
     def step(self, prediction: Tensor, k: int, noisy: Tensor) -> Tensor:
         """One DDIM step from k to k - K / inference_steps, (B, H, A) -> (B, H, A).
 
-        Sampler `ddim` puts back the noise that leads from the prediction, before clipping, to
-        `noisy`. DP3 pins diffusers 0.11.1, which puts back the predicted sample instead of noise
-        (sampler `dp3`): every step then starts from a guess without noise, and more rollouts
-        succeed.
+        Sampler `ddim` adds back the noise that turns the unclipped prediction into `noisy`. DP3
+        pins diffusers 0.11.1, which adds back the predicted sample instead of noise (sampler
+        `dp3`): every step then starts from a guess without noise, and more rollouts succeed.
         """
-        stride = self.diffusion_steps // self.inference_steps
         a = self.alphas_cumprod[k]
-        a_next = self.alphas_cumprod[k - stride] if k >= stride else torch.ones_like(a)
+        a_next = self.alphas_cumprod[k - self.stride] if k >= self.stride else torch.ones_like(a)
         if self.sampler == "dp3":
             noise = prediction
         else:
@@ -570,9 +600,9 @@ class Normalizer(nn.Module):
     def fit(self, recordings: Iterable[Recording]) -> None:
         """Sets the ranges to those of all recordings together.
 
-        A coordinate that hardly moves (range under 1e-4) is centred and not stretched. But one of
-        an action is divided by 5e-5: whatever is drawn in [-1, 1] then maps back to within 5e-5 of
-        the constant.
+        A coordinate that hardly moves (range under 1e-4) is centred and not stretched. Such a
+        coordinate of an action is divided by 5e-5 instead, so that any number drawn in [-1, 1] maps
+        back to within 5e-5 of the constant.
         """
         recordings = list(recordings)
         for name in ("points", "state", "action"):
@@ -595,26 +625,7 @@ class Normalizer(nn.Module):
         return x * getattr(self, f"{name}_scale") + getattr(self, f"{name}_center")
 
 
-# ---- Batches -------------------------------------------------------------------------------------
-
-# What a batch says of its task. Every other entry has one row for each window.
-TASK_INPUTS = ("text", "demo_points", "demo_state", "demo_action")
-
-
-def split(batch: dict[str, Tensor], n: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Splits a task's windows by index: the first n for support, the others for query.
-
-    `batch` holds the arguments of `DAMIPolicy.loss`. Both parts keep the whole of what says the
-    task, `TASK_INPUTS`.
-    """
-    support, query = {}, {}
-    for name, x in batch.items():
-        support[name] = x if name in TASK_INPUTS else x[:n]
-        query[name] = x if name in TASK_INPUTS else x[n:]
-    return support, query
-
-
-# ---- The policies, and their moving average ------------------------------------------------------
+# ---- The policies --------------------------------------------------------------------------------
 
 Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None: no task is read
 
@@ -622,7 +633,7 @@ Context = tuple[Tensor, ...] | None  # what `encode_demo` makes of a task; None:
 class DAMIPolicy(nn.Module):
     """The policy: two observations, an instruction and a demonstration in; actions out.
 
-    Raises ValueError for the configuration of another policy, or one that does not fit this class.
+    Raises ConfigError for the configuration of another policy, or one that does not fit this class.
     """
 
     # What a subclass may override:
@@ -635,7 +646,7 @@ class DAMIPolicy(nn.Module):
         self.config = config
         self.normalizer = Normalizer(config.state_dim, config.action_dim, config.point_dim)
         self.observation_encoder = ObservationEncoder(config)
-        if config.demo_encoder != "none":
+        if config.reads_demonstration:
             self.demo_encoder = demo_encoders[config.demo_encoder](config)
         if config.tcfm != "none":
             self.u2t = UnpairedUnifiedTask(config)
@@ -651,27 +662,17 @@ class DAMIPolicy(nn.Module):
 
     @classmethod
     def check_config(cls, config: PolicyConfig) -> None:
-        """Raises ValueError for a configuration that names another class, or does not fit this."""
+        """Raises ConfigError for a configuration that names another class, or does not fit this."""
         named = POLICIES[config.policy]
         if named is not cls:
-            raise ValueError(
+            raise ConfigError(
                 f"policy {config.policy!r} is a {named.__name__} and no {cls.__name__}: "
                 "use build_policy, or name this class in model.POLICIES"
             )
-        for name, value in cls.requires.items():
-            found = getattr(config, name)
-            if found != value:
-                raise ValueError(f"policy {config.policy} needs {name} {value!r}, not {found!r}")
-
-    @property
-    def reads_task(self) -> bool:
-        """Whether an instruction or a demonstration names the task."""
-        return self.config.reads_task
-
-    @property
-    def reads_demonstration(self) -> bool:
-        """Whether the policy reads a demonstration."""
-        return self.config.demo_encoder != "none"
+        for name, needed in cls.requires.items():
+            value = getattr(config, name)
+            if value != needed:
+                raise ConfigError(f"policy {config.policy} needs {name} {needed!r}, not {value!r}")
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The parameters by adaptation learning rate: `vision`, `diffusion`, `other` (VMT, U2T)."""
@@ -699,7 +700,7 @@ class DAMIPolicy(nn.Module):
         demo_state: Tensor | None = None,
         demo_action: Tensor | None = None,
     ) -> Context:
-        """Encodes what names a task. It depends on no observation: once a rollout is enough.
+        """Encodes the instruction and the demonstration. One call serves a whole rollout.
 
         Args:
             text: instruction features (D, text_dim).
@@ -714,9 +715,9 @@ class DAMIPolicy(nn.Module):
             ValueError: an input is missing or has a wrong shape, or a demonstration has more frames
                 than there are learned positions.
         """
-        if not self.reads_task:
+        if not self.config.reads_task:
             return None
-        if not self.reads_demonstration:
+        if not self.config.reads_demonstration:
             self.check_shapes(text=text)
             return self.u2t.encode_context(None, text)
         self.check_shapes(
@@ -728,6 +729,8 @@ class DAMIPolicy(nn.Module):
         features = self.encode_observations(demo_points, demo_state)  # (D, T, feature)
         actions = self.normalizer.normalize("action", demo_action)  # (D, T, A)
         tokens = self.demo_encoder(features, actions)  # (D, T, demo_dim)
+        if tokens.shape[1] > most:
+            raise ValueError(f"the encoder made {tokens.shape[1]} tokens of {most} positions")
         return self.u2t.encode_context(tokens, text)
 
     def denoise(
@@ -737,10 +740,11 @@ class DAMIPolicy(nn.Module):
         h = self.condition_encoder(timesteps, observation)  # (B, C)   Eq. 7
         if context is None:
             return self.denoiser(noisy, h)
-        if len(h) % len(context[0]) != 0:
-            raise ValueError(f"{len(h)} windows cannot be of {len(context[0])} tasks alike")
+        B, D = len(h), len(context[0])
+        if B % D != 0:
+            raise ValueError(f"{B} windows cannot be shared equally by {D} tasks")
         fused = self.u2t(h, context)  # (B, C)
-        if self.config.tcfm == "none":
+        if self.config.tcfm == "none":  # the ablation, in which it modulates every level
             return self.denoiser(noisy, fused)
         return self.denoiser(noisy, h, fused)
 
@@ -800,7 +804,7 @@ class DAMIPolicy(nn.Module):
             ValueError: the context is missing, an input has a wrong shape, or D does not divide B.
         """
         self.check_shapes(points=points, state=state)
-        if context is None and self.reads_task:
+        if context is None and self.config.reads_task:
             raise ValueError("context is missing: it is what `encode_demo` makes of a task")
         observation = self.encode_observations(points, state).flatten(1)  # (B, To * feature)
         shape = (len(points), self.config.horizon, self.config.action_dim)
@@ -843,20 +847,20 @@ class DAMIPolicy(nn.Module):
         sizes = {}  # letter -> its size in the first input that has it
         for name, x in inputs.items():
             expected = shapes[name]
-            if x is not None and x.dim() == len(expected):
+            if x is None:
+                takes = str(expected).replace("'", "")
+                raise ValueError(f"{name} is missing, the policy takes {takes}")
+            if x.dim() == len(expected):
                 for letter, size in zip(expected, x.shape):
                     if isinstance(letter, str):
                         sizes.setdefault(letter, size)
                 expected = tuple(sizes.get(letter, letter) for letter in expected)
-            if x is None or tuple(x.shape) != expected:
-                found = "missing" if x is None else tuple(x.shape)
+            if tuple(x.shape) != expected:
                 takes = str(expected).replace("'", "")
-                advice = ""
-                if "points" in name and x is not None and x.dim() == len(expected):
-                    N = self.config.num_points
-                    if x.shape[-2] > N:
-                        advice = f": `data.farthest_point_sample(cloud, {N})` draws so many points"
-                raise ValueError(f"{name} is {found}, the policy takes {takes}{advice}")
+                advice, N = "", self.config.num_points
+                if "points" in name and x.dim() == len(expected) and x.shape[-2] > N:
+                    advice = f": `data.farthest_point_sample(cloud, {N})` draws so many points"
+                raise ValueError(f"{name} is {tuple(x.shape)}, the policy takes {takes}{advice}")
 
     def draw_noise_and_timesteps(self, n: int, generator: Generator) -> dict[str, Tensor]:
         """Draws what makes `loss` pure: noise (n, H, A) float32 and timesteps (n,) int64.
@@ -876,11 +880,43 @@ class DP3Policy(DAMIPolicy):
     requires: ClassVar = {"demo_encoder": "none", "tcfm": "none"}
 
 
-def ema_model(policy: DAMIPolicy) -> AveragedModel:
-    """The exponential moving average of a policy in training; the averaged policy is its `.module`,
-    in evaluation mode.
+POLICIES["dami"] = DAMIPolicy
+POLICIES["dp3"] = DP3Policy
 
-    `.update_parameters(policy)` must be called after each step. The decay grows as in the paper.
+
+def build_policy(config: PolicyConfig) -> DAMIPolicy:
+    """The policy that a configuration names, with fresh weights.
+
+    Raises ConfigError, as the policy's class does, for a configuration that does not fit it.
+    """
+    return POLICIES[config.policy](config)
+
+
+# ---- For training --------------------------------------------------------------------------------
+
+# The entries of a batch that describe its task, one row for each demonstration. All others have one
+# row for each window.
+TASK_INPUTS = ("text", "demo_points", "demo_state", "demo_action")
+
+
+def split(batch: dict[str, Tensor], n: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Splits a task's windows by index: the first n for support, the others for query.
+
+    `batch` holds the arguments of `DAMIPolicy.loss`. Both parts keep the entries of `TASK_INPUTS`
+    whole.
+    """
+    support, query = {}, {}
+    for name, x in batch.items():
+        support[name] = x if name in TASK_INPUTS else x[:n]
+        query[name] = x if name in TASK_INPUTS else x[n:]
+    return support, query
+
+
+def ema_model(policy: DAMIPolicy) -> AveragedModel:
+    """Makes the exponential moving average of a policy, whose decay grows as in the paper.
+
+    Its `.module` is the averaged policy, in evaluation mode. `.update_parameters(policy)` must be
+    called after each step.
     """
 
     @torch.no_grad()
@@ -898,31 +934,7 @@ def loss_of(policy: DAMIPolicy, params: dict[str, Tensor], batch: dict[str, Tens
     return functional_call(policy, params, (), batch)
 
 
-# ---- What a configuration names, and presets -----------------------------------------------------
-
-
-# The policies by `PolicyConfig.policy`. baselines.py adds its own when it is imported.
-POLICIES: dict[str, type[DAMIPolicy]] = {"dami": DAMIPolicy, "dp3": DP3Policy}
-
-
-def choices() -> dict[str, tuple[str, ...]]:
-    """Field of `PolicyConfig` -> the names that it may hold, registered ones among them."""
-    return {
-        "policy": tuple(POLICIES),
-        "denoiser": tuple(denoisers),
-        "demo_encoder": (*demo_encoders, "none"),
-        "tcfm": ("down", "mid", "up", "none"),
-        "sampler": ("ddim", "dp3"),
-    }
-
-
-def build_policy(config: PolicyConfig) -> DAMIPolicy:
-    """The policy that a configuration names, with fresh weights.
-
-    Raises ValueError, as the policy's class does, for a configuration that does not fit it.
-    """
-    return POLICIES[config.policy](config)
-
+# ---- Presets -------------------------------------------------------------------------------------
 
 # `small` is for two CPU cores, `tiny` to see everything run. What is not named here is the paper's.
 # fmt: off
@@ -953,7 +965,7 @@ class CheckpointError(ValueError):
 def save(path: str | Path, policy: DAMIPolicy, *, half: bool = False, **info: Any) -> None:
     """Writes a policy to a file: its configuration, weights and normalizer, and `info`.
 
-    The file is written whole or not at all: what was there before stays until the new one is.
+    The file is written whole or not at all: the old file stays until the new one is complete.
 
     Args:
         half: stores the weights as float16, half the size; `load` gives float32 again.
@@ -992,6 +1004,8 @@ def load(
 ) -> tuple[DAMIPolicy, dict[str, Any]]:
     """Rebuilds the policy that `save` wrote to a file, in evaluation mode on `device`.
 
+    It draws fresh weights before it reads those of the file, from PyTorch's global generator.
+
     Args:
         needs: the names that `info` must have.
         config_overrides: fields of the configuration that take the place of those in the file.
@@ -1015,7 +1029,7 @@ def load(
             f"{path} is of another version of the code, with settings that are unknown here: "
             f"{', '.join(unknown)}"
         )
-    if config.get("policy", "dami") not in POLICIES:
+    if config.get("policy", "dami") not in tuple(POLICIES):  # which no list can be a key of
         raise CheckpointError(
             f"{path}: policy {config['policy']!r} is unknown: import the file that adds it first, "
             "such as baselines.py"
@@ -1023,24 +1037,21 @@ def load(
     try:
         config = PolicyConfig(**config)
         POLICIES[config.policy].check_config(config)
-    except (TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{path}: weights and configuration do not fit: {one_line(error)}"
-        ) from error
+    except (TypeError, ConfigError) as error:  # TypeError: a number in place of a tuple
+        raise CheckpointError(f"{path}: its settings do not fit: {one_line(error)}") from error
     try:
         config = replace(config, **config_overrides)
-        POLICIES[config.policy].check_config(config)
-    except (TypeError, ValueError) as error:
+        with torch.device("meta"):  # takes no memory, for a size that the file may not hold
+            empty = build_policy(config)
+    except ConfigError as error:
         raise CheckpointError(f"{path} cannot be used like this: {one_line(error)}") from error
-    with torch.device("meta"):  # takes no memory, for a size that the file may not hold
-        empty = build_policy(config)
     expected = {name: tuple(x.shape) for name, x in empty.state_dict().items()}
-    found = {name: tuple(x.shape) for name, x in weights.items()}
-    for name in [*expected, *found]:
-        if found.get(name) != expected.get(name):
+    stored = {name: tuple(getattr(x, "shape", ())) for name, x in weights.items()}
+    for name in [*expected, *stored]:
+        if stored.get(name) != expected.get(name):
             raise CheckpointError(
-                f"{path}: weights and configuration do not fit: {name} is {found.get(name)} in the "
-                f"file, and {expected.get(name)} in the policy"
+                f"{path}: weights and configuration do not fit: {name} is {stored.get(name)} in "
+                f"the file, and {expected.get(name)} in the policy"
             )
 
     policy = build_policy(config).to(device)

@@ -597,6 +597,11 @@ def start(simulator: Simulator, suite: str, settings: Settings) -> Run:
     return Run(GaussianPolicy(state_dim, action_dim, settings.hidden))
 
 
+def count_steps(settings: Settings, simulator: Simulator) -> int:
+    """The steps of the simulator in one iteration: rollouts before and after the inner step."""
+    return 2 * settings.goals * settings.rollouts * simulator.episode_steps
+
+
 def train(
     run: Run,
     simulator: Simulator,
@@ -610,12 +615,8 @@ def train(
     `run` is changed in place, and saved into `folder` after each iteration.
     """
     tasks, _ = simulator.tasks(suite)
-    steps_of_iteration = 2 * settings.goals * settings.rollouts * simulator.episode_steps
+    steps_of_iteration = count_steps(settings, simulator)
     iterations = math.ceil(settings.steps / steps_of_iteration)
-    if iterations < run.iteration:
-        raise UserError(
-            f"--steps is {settings.steps}: {run.iteration * steps_of_iteration} are taken already"
-        )
     log = folder / "metrics.jsonl"
     kept = [line for line in read_json_lines(log) if line["iteration"] <= run.iteration]
     write_text(log, "".join(f"{json.dumps(line)}\n" for line in kept))
@@ -737,8 +738,12 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise UserError(f"{folder} already holds a run: add --resume, or another --out")
         else:
             run = start(simulator, args.suite, settings)
-        # Without old results, --resume alone goes on from here.
-        (folder / "success.json").unlink(missing_ok=True)
+        steps_of_iteration = count_steps(settings, simulator)
+        if run.iteration > math.ceil(settings.steps / steps_of_iteration):
+            taken = run.iteration * steps_of_iteration
+            raise UserError(f"--steps is {settings.steps}: {taken} are taken already")
+        for name in ("success.json", "success.md", "success.png"):
+            (folder / name).unlink(missing_ok=True)  # without them, --resume alone goes on
         print_settings(asdict(settings), asdict(Settings()))
         steps = train(run, simulator, args.suite, settings, folder, args.workers)
         base_tasks, novel_tasks = simulator.tasks(args.suite)

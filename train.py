@@ -747,9 +747,9 @@ def heldout_controls(
     """
     measure = partial(evaluate.evaluate_heldout, policy, train_samplers, heldout_samplers, text)
     rows = {}
-    if policy.reads_demonstration and len(train_samplers) > 1:
+    if policy.config.reads_demonstration and len(train_samplers) > 1:
         rows["another task's demonstration"] = mean_of_tasks(measure(swap_demonstrations=True))
-    if policy.reads_demonstration:
+    if policy.config.reads_demonstration:
         rows["zeros for a demonstration"] = mean_of_tasks(measure(demonstration_control="zeros"))
     if settings.pretrain_steps == settings.steps:  # there was no inner step in training
         return rows
@@ -915,8 +915,14 @@ def preset_settings(preset: str, suite: str) -> Settings:
 # A policy for own recordings can read demonstrations of up to 500 frames, the paper's number on a
 # real robot, or as long as the longest of the recordings.
 OWN_FRAMES = 500
-# The fields of PolicyConfig that are flags
-ARCHITECTURE = ("policy", "demo_encoder", "denoiser", "tcfm", "sampler", "num_points")
+ARCHITECTURE = {  # the fields of PolicyConfig that are flags, and their help
+    "policy": "DAMI, or one that the paper compares it with, see baselines.py",
+    "demo_encoder": "what encodes the demonstration; none: it is not read",
+    "denoiser": "the network that denoises actions, a key of model.denoisers",
+    "tcfm": "where U2T's output modulates the U-Net; none: nowhere, see model.PolicyConfig",
+    "sampler": "DDIM as published, or as DP3 runs it",
+    "num_points": "points of a cloud",
+}
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -939,13 +945,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
     group = parser.add_argument_group("architecture (default: the preset's)")
     choices = {**model.choices(), "policy": tuple(baselines.PRESETS)}
-    for name in ARCHITECTURE:
+    for name, text in ARCHITECTURE.items():
         values = {preset: getattr(config, name) for preset, config in model.PRESETS.items()}
         group.add_argument(
             common.flag_name(name),
             type=str if name in choices else int,
             choices=choices.get(name),
-            help="see model.PolicyConfig" + common.describe_presets(values),
+            help=text + common.describe_presets(values),
         )
     group = parser.add_argument_group(
         "settings", "Default: the preset's. goals-*, pairs and convention-* change some of them."
@@ -980,7 +986,7 @@ def choose_architecture(args: argparse.Namespace, preset: str) -> PolicyConfig:
         config = replace(config, **{name: x for name, x in flags.items() if x is not None})
         with torch.device("meta"):  # which takes no memory
             model.build_policy(config)  # refuses what does not fit
-    except ValueError as error:
+    except model.ConfigError as error:
         raise UserError(str(error)) from error
     return config
 
@@ -1263,7 +1269,9 @@ def run(
 
         columns = {}
         if outcomes is not None and settings.evaluate_on == "novel":
-            columns = evaluation.contributions(outcomes, state.policy.reads_demonstration, stop)
+            columns = evaluation.contributions(
+                outcomes, state.policy.config.reads_demonstration, stop
+            )
         elif outcomes is not None:
             columns = {"last checkpoint": outcomes}
     if rank == 0:

@@ -229,6 +229,21 @@ def test_only_points_in_the_box_are_returned_and_all_of_them(box):
     assert len(cut) > 50 or (box[0][2] == 3 and cut.shape == (0, 3))
 
 
+def test_points_whose_rays_run_in_a_face_of_the_box_are_kept():
+    xml = """<mujoco><worldbody><body pos="0 1 1">
+      <geom name="wall" type="box" size="2 0.1 2"/>
+    </body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    view = {"position": (0, -2, 1), "lookat": (0, 0, 1), "width": 65, "height": 65}
+    points = RayCastCamera(model, **view).points(data)
+    inside = points[points[:, 0] >= 0]
+    assert (inside[:, 0] == 0).sum() > 20  # the middle column of the picture
+    box = ((0.0, -5.0, -5.0), (5.0, 5.0, 5.0))
+    np.testing.assert_array_equal(RayCastCamera(model, box=box, **view).points(data), inside)
+
+
 def test_colors_and_ids_are_those_of_geoms_and_sites():
     model, data = scene(BALLS)
     camera = RayCastCamera(model, "down")

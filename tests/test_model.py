@@ -16,8 +16,10 @@ from diffusers import DDIMScheduler
 from diffusers.models.embeddings import get_timestep_embedding
 
 import baselines
+import common
 import data
 import model
+import train
 from model import (
     PRESETS,
     TASK_INPUTS,
@@ -152,7 +154,7 @@ def peer():
 
 
 def test_noising_equals_that_of_diffusers_at_every_step(peer):
-    schedule, every = DiffusionSchedule(), torch.arange(100)
+    schedule, every = DiffusionSchedule(100, 10, "ddim"), torch.arange(100)
     clean, noise = torch.randn(2, 100, 16, 4, generator=torch.Generator().manual_seed(0))
     expected = peer.add_noise(clean, noise, every)
     torch.testing.assert_close(
@@ -161,7 +163,7 @@ def test_noising_equals_that_of_diffusers_at_every_step(peer):
 
 
 def test_sampling_equals_a_full_run_of_diffusers(peer):
-    schedule, g = DiffusionSchedule(), torch.Generator().manual_seed(0)
+    schedule, g = DiffusionSchedule(100, 10, "ddim"), torch.Generator().manual_seed(0)
     assert schedule.timesteps() == peer.timesteps.tolist()
     ours = theirs = torch.randn(3, 16, 4, generator=g)
     clean = 3 * torch.rand(3, 16, 4, generator=g) - 1.5  # a third of it is to be clipped
@@ -585,7 +587,7 @@ def test_whatever_a_configuration_names_is_built_and_has_a_loss_or_is_refused_in
         unused = [name for name, p in policy.named_parameters() if p.grad is None]
         assert unused == [], config
         context = context_of(policy, batch)
-        assert (context is None) == (not policy.reads_task)
+        assert (context is None) == (not policy.config.reads_task)
         policy.sample_actions(batch["points"], batch["state"], context, g)
     dami = {
         ("dami", net, *rest)
@@ -653,6 +655,16 @@ def test_a_mistake_in_a_network_keeps_its_own_error_when_a_checkpoint_is_loaded(
     with pytest.raises(ValueError, match="too many values to unpack") as error:
         model.load(tmp_path / "toy.pt")
     assert not isinstance(error.value, CheckpointError)
+    with pytest.raises(ValueError, match="too many values to unpack") as error:
+        train.choose_architecture(train.parse(["--denoiser", "toy"]), "tiny")
+    assert not isinstance(error.value, common.UserError)
+
+
+def test_a_network_that_does_not_fit_the_policy_of_a_checkpoint_is_refused(tmp_path):
+    model.save(tmp_path / "dami.pt", new_policy())
+    message = "cannot be used like this: frequency-transformer is the denoiser of freq, not dami"
+    with pytest.raises(CheckpointError, match=message):
+        model.load(tmp_path / "dami.pt", denoiser="frequency-transformer")
 
 
 # ---- Checkpoints ---------------------------------------------------------------------------------
@@ -710,6 +722,10 @@ def bad_checkpoints(folder, good):
     info = torch.load(good, weights_only=True)
     torch.save(info | {"config": info["config"] | {"unet_widths": [32, 64]}}, folder / "shape")
     torch.save(info | {"config": info["config"] | {"flavor": 1}}, folder / "newer")
+    torch.save(info | {"config": info["config"] | {"policy": ["dami"]}}, folder / "unhashable")
+    torch.save(info | {"config": info["config"] | {"sampler": "euler"}}, folder / "setting")
+    number = info["model"] | {"normalizer.state_center": 3}
+    torch.save(info | {"model": number}, folder / "number")
     torch.save({name: x for name, x in info.items() if name != "model"}, folder / "headless")
     return {
         "missing": "no checkpoint at",
@@ -723,6 +739,9 @@ def bad_checkpoints(folder, good):
         "shape": "do not fit: denoiser.down.0.0.conv1.0.weight is (16, 4, 5) in the file, and (32,",
         "newer": "another version of the code, with settings that are unknown here: flavor",
         "headless": "its model is missing",
+        "unhashable": "policy ['dami'] is unknown",
+        "setting": "its settings do not fit: sampler is 'euler'; use one of ddim, dp3",
+        "number": "do not fit: normalizer.state_center is () in the file, and (9,) in the policy",
     }
 
 
@@ -959,7 +978,9 @@ def test_wrong_inputs_are_refused_with_both_shapes(changes, message):
 def test_windows_that_the_tasks_do_not_divide_are_refused(tcfm, windows, tasks):
     policy = new_policy(tcfm=tcfm)
     batch = random_batch(policy.config, windows=windows, tasks=tasks)
-    with pytest.raises(ValueError, match=f"{windows} windows cannot be of {tasks} tasks alike"):
+    with pytest.raises(
+        ValueError, match=f"{windows} windows cannot be shared equally by {tasks} tasks"
+    ):
         policy.loss(**batch)
 
 

@@ -354,6 +354,7 @@ def test_mistakes_are_one_line(point_suite, capsys, arguments, message):
     with pytest.raises(SystemExit, match="2"):
         common.command_line(lambda: rl.main([*point_suite, "160", *arguments]))
     assert message in capsys.readouterr().err.splitlines()[-1]
+    assert Path("run/success.json").exists()  # a mistake costs no results
 
 
 def test_meta_worlds_state_hides_the_goal_alone():

@@ -103,7 +103,7 @@ def test_a_network_is_a_class_and_a_line(here, own_folder, monkeypatch):
     call(train, f"--suite toy --preset tiny --steps 1 --denoiser toy-mlp --out run {QUICK}")
     policy, _ = model.load("run/ema-00001.pt")
     assert isinstance(policy.denoiser, ToyMLP) and policy.config.denoiser == "toy-mlp"
-    assert policy.reads_task and policy.reads_demonstration
+    assert policy.config.reads_task and policy.config.reads_demonstration
     assert "loss_before" in metrics(own_folder / "run")[0]  # there was an inner step
 
     # Its learning rate in adaptation is that of a denoiser, whatever it is called.
