@@ -39,7 +39,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,11 +57,13 @@ from data import Demonstrations, RecordingError
 from model import CheckpointError
 
 try:
-    from termios import error as TerminalError  # raised by pyserial if an adapter is pulled out
+    import termios
+    import tty
 
-    TERMINAL_ERRORS: tuple = (TerminalError,)
-except ImportError:  # Windows has no terminals of this kind
-    TERMINAL_ERRORS = ()
+    TerminalError = termios.error  # raised by pyserial if an adapter is pulled out
+except ImportError:  # Windows has neither
+    termios = None
+    TerminalError = OSError
 
 STATE_DIM = ACTION_DIM = 7
 
@@ -69,7 +71,7 @@ STATE_DIM = ACTION_DIM = 7
 class RobotError(Exception):
     """Arm, gripper or camera cannot go on; the message says why.
 
-    Where nobody catches it, it ends the command, and the arm is stopped.
+    If no caller handles it, the command ends and the arm is stopped.
     """
 
 
@@ -80,7 +82,8 @@ class CameraError(RobotError):
 class StaleState(RobotError):
     """The newest state is too old.
 
-    `arrived`: newer ones have arrived, but this computer was too busy to read them.
+    `arrived`: True if newer states wait unread in the socket, because this computer was too busy;
+    False if the network or the controller is late.
     """
 
     def __init__(self, message: str, arrived: bool) -> None:
@@ -100,7 +103,7 @@ ROUNDING = 1e-6  # metres: a corner of the box that was written as float32 is st
 class Settings:
     """What the JSON file of --config holds, in metres, radians and the robot's base frame.
 
-    The first five have no default: they belong to the place where the arm stands. Raises
+    The first five have no default, because they depend on where the arm is mounted. Raises
     ValueError, in one line, for a value of the wrong type, out of range, or at odds with another.
     `check_steps` and `check_poses` tell whether the arm may do what it is to do.
     """
@@ -361,6 +364,7 @@ class RTDE:
 
     def __init__(self, host: str, port: int = 30004, hz: float = 125.0, write: bool = False):
         self.name = f"RTDE at {host}:{port}"
+        self.writes = write
         self.controller_said = ""  # the controller's last text message, as an error ends with it
         self.buffer = b""  # received, and not yet a whole package
         self.newest: State | None = None
@@ -496,8 +500,7 @@ class RTDE:
                 readable, _, _ = select.select([self.socket], [], [], 0)
             except (OSError, ValueError):  # closed meanwhile
                 raise self.lost("connection closed") from None
-            message = str(self.lost(f"the newest state is {age:.3f} s old"))
-            raise StaleState(message, arrived=bool(readable))
+            raise StaleState(f"{self.name}: the newest state is {age:.3f} s old", bool(readable))
         return self.newest
 
     def send(self, pose: np.ndarray, stop: bool = False) -> None:
@@ -698,12 +701,15 @@ class Gripper:
             raise RobotError(f"the gripper at {self.where} cannot be reached: {error}") from None
         self.close = self.port.close
 
-    def exchange(self, function: int, register: int, value: int) -> int:
-        """Writes `value` to a register, or reads one; returns the value in the answer.
+    def read_register(self, register: int) -> int:
+        return self.exchange(READ, register, 1)  # one register from there on
 
-        To read, `value` is how many registers are asked for: 1.
-        """
-        request = struct.pack(">BBHH", self.settings.gripper_slave, function, register, value)
+    def write_register(self, register: int, value: int) -> None:
+        self.exchange(WRITE, register, value)
+
+    def exchange(self, function: int, register: int, argument: int) -> int:
+        """Sends a request and returns the value in its answer."""
+        request = struct.pack(">BBHH", self.settings.gripper_slave, function, register, argument)
         request += crc16(request)
         for _ in range(self.ATTEMPTS):
             try:
@@ -712,7 +718,7 @@ class Gripper:
                 answer = self.port.read(5)  # the whole of an exception frame
                 if len(answer) == 5 and not answer[1] & 0x80:
                     answer += self.port.read(2 if function == READ else 3)
-            except (OSError, *TERMINAL_ERRORS) as error:
+            except (OSError, TerminalError) as error:
                 problem = str(error)
                 continue
             if len(answer) < 5:
@@ -731,17 +737,17 @@ class Gripper:
 
     def initialize(self, timeout: float = 10.0) -> None:
         """Initializes a gripper that is not, which opens and closes it; then sets the force."""
-        if self.exchange(READ, INITIALIZED, 1) != 1:
+        if self.read_register(INITIALIZED) != 1:
             print("the gripper is initialized: it opens and closes", flush=True)
-            self.exchange(WRITE, INITIALIZE, 1)
+            self.write_register(INITIALIZE, 1)
             deadline = time.monotonic() + timeout
-            while self.exchange(READ, INITIALIZED, 1) != 1:
+            while self.read_register(INITIALIZED) != 1:
                 if time.monotonic() > deadline:
                     raise RobotError(
                         f"the gripper at {self.where} is not ready after {timeout:g} s"
                     )
                 time.sleep(0.05)
-        self.exchange(WRITE, FORCE, self.settings.gripper_force_percent)
+        self.write_register(FORCE, self.settings.gripper_force_percent)
 
     def move(self, closed: float) -> None:
         """Goes to 0 (open) ... 1 (closed); nothing is sent for a change below 1 %.
@@ -753,12 +759,12 @@ class Gripper:
         share = min(1.0, max(0.0, closed))
         position = round(share * closed_at + (1 - share) * open_at)
         if self.commanded is None or abs(position - self.commanded) >= 10:
-            self.exchange(WRITE, POSITION, position)
+            self.write_register(POSITION, position)
             self.commanded = position
 
     def read(self) -> float:
         """Where it is, 0 (open) ... 1 (closed)."""
-        return abs(self.settings.gripper_open_at - self.exchange(READ, POSITION_NOW, 1)) / 1000
+        return abs(self.settings.gripper_open_at - self.read_register(POSITION_NOW)) / 1000
 
 
 # ---- Camera: depth to points in the robot's base frame -------------------------------------------
@@ -983,15 +989,22 @@ def difference(pose: np.ndarray, later: np.ndarray) -> np.ndarray:
     return np.concatenate([later[:3] - pose[:3], turn])
 
 
+def other_rotvec(rotvec: np.ndarray) -> np.ndarray:
+    """The other vector (3,) of the same rotation, by a - 2 pi where this one is by a.
+
+    No rotation has only one, 0.
+    """
+    angle = np.linalg.norm(rotvec)
+    return rotvec * (1 - 2 * np.pi / angle) if angle > 0 else rotvec
+
+
 def nearer(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Of the two vectors (3,) of one rotation, angles a and a - 2 pi, the nearer to `reference`.
 
     For a tool that points down, half a turn from the base, the controller's jumps between them.
     Where both are as far from `reference`, the result jumps, too.
     """
-    angle = np.linalg.norm(rotvec)
-    other = rotvec * (1 - 2 * np.pi / angle) if angle > 0 else rotvec
-    return min(rotvec, other, key=lambda v: np.linalg.norm(v - reference))
+    return min(rotvec, other_rotvec(rotvec), key=lambda v: np.linalg.norm(v - reference))
 
 
 def write_rotation(rotvec: np.ndarray) -> str:
@@ -1019,6 +1032,11 @@ def toward(pose: np.ndarray, target: np.ndarray, most: np.ndarray) -> np.ndarray
     step = difference(pose, target)
     shares = np.minimum(1, most / lengths(step).clip(1e-12))  # (2,) of the way, of the turn
     return compose(pose, step * np.repeat(shares, 3))
+
+
+def overspeed(actions: np.ndarray, settings: Settings) -> np.ndarray:
+    """How many times as fast as targets may move each action (n, 7) is: (n,)."""
+    return (lengths(actions) * settings.policy_hz / settings.target_speed).max(axis=1)
 
 
 def warn(text: str) -> None:
@@ -1056,16 +1074,11 @@ class Servo:
     SLOW = "the policy or the camera is too slow"
 
     def __init__(
-        self,
-        rtde: RTDE,
-        settings: Settings,
-        moves: bool = True,
-        free: bool = False,
-        activity: Activity | None = None,
+        self, rtde: RTDE, settings: Settings, free: bool = False, activity: Activity | None = None
     ) -> None:
         self.rtde = rtde
         self.settings = settings
-        self.moves = moves  # False: a dry run
+        self.moves = rtde.writes  # False: a dry run
         self.free = free  # True: the arm is only kept free to be moved by hand
         self.activity = activity or Activity()
 
@@ -1080,7 +1093,6 @@ class Servo:
 
         self.lock = threading.Lock()  # of the targets
         self.error: str | None = None  # why the arm was stopped
-        self.ended = threading.Event()
         self.counters: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
         # The least delay of all states. To all delays a constant is added, which does not matter.
         self.least_delay = math.inf
@@ -1096,40 +1108,50 @@ class Servo:
 
     def start(self, host: str) -> None:
         """Starts the program on the controller where the arm now is, and begins to stream."""
-        settings = self.settings
-        deadline = time.monotonic() + self.PATIENCE
-        uploaded = False
-        while True:
-            state = self.rtde.state(settings.max_state_age_s)
-            self.pose = state.pose  # not an older one: the arm may have been moved meanwhile
-            try:
-                self.check_start(state, deadline, uploaded)
-            except RobotError as error:
-                raise RobotError(f"the arm is not moved: {error}") from None
-            if not self.moves or self.rtde.program_runs(state):
-                break
-            self.send(self.pose)
-            if not uploaded:
-                text = program(self.rtde.session, settings, self.free)
-                upload(host, settings.script_port, text, waiting=lambda: self.send(self.pose))
-                uploaded = True
-            time.sleep(1 / settings.servo_hz)
+        state = self.check_start()
+        if self.moves:
+            self.send(state.pose)  # in the registers before the program reads them
+            text = program(self.rtde.session, self.settings, self.free)
+            upload(host, self.settings.script_port, text, waiting=lambda: self.send(self.sent))
+            state = self.wait_for_program()
+        self.pose = state.pose
         self.held_since = time.monotonic()
         self.last_step = (self.held_since, time.process_time())
         self.thread.start()
 
-    def check_start(self, state: State, deadline: float = math.inf, uploaded: bool = False) -> None:
-        """Raises RobotError if the program must not be started in this state, or does not start."""
-        state.check()
-        if not self.free:
-            self.settings.check_poses([state.pose])
-        if time.monotonic() > deadline:
-            raise RobotError(
-                f"its program has not started within {self.PATIENCE:g} s: is the robot in remote "
-                f"control, and the secondary interface allowed?{self.rtde.controller_said}"
-            )
-        if self.moves and not uploaded and state.values["robot_status_bits"] & PROGRAM_RUNNING:
-            raise RobotError("another program runs there, stop it first")
+    def check_start(self) -> State:
+        """The present state. Raises RobotError if no program must be started in it."""
+        state = self.movable_state()
+        if self.moves and state.values["robot_status_bits"] & PROGRAM_RUNNING:
+            raise RobotError("the arm is not moved: another program runs there, stop it first")
+        return state
+
+    def movable_state(self) -> State:
+        """The present state. Raises RobotError if the arm must not be moved in it."""
+        state = self.rtde.state(self.settings.max_state_age_s)
+        try:
+            state.check()
+            if not self.free:
+                self.settings.check_poses([state.pose])
+        except RobotError as error:
+            raise RobotError(f"the arm is not moved: {error}") from None
+        return state
+
+    def wait_for_program(self) -> State:
+        """Sends where the arm is until the program runs, and returns the state in which it does."""
+        deadline = time.monotonic() + self.PATIENCE
+        while True:
+            state = self.movable_state()
+            if self.rtde.program_runs(state):
+                return state
+            if time.monotonic() > deadline:
+                raise RobotError(
+                    f"the arm is not moved: its program has not started within {self.PATIENCE:g} s "
+                    "(is the robot in remote control, and the secondary interface allowed?)"
+                    f"{self.rtde.controller_said}"
+                )
+            self.send(state.pose)
+            time.sleep(1 / self.settings.servo_hz)
 
     def send(self, pose: np.ndarray) -> None:
         self.sent = pose
@@ -1151,7 +1173,7 @@ class Servo:
             times = time.monotonic() + np.arange(1, len(poses)) / self.settings.policy_hz
             self.targets = list(zip(times, poses[1:]))
             self.broken_off = False
-        self.slowed += self.too_fast(actions)
+        self.slowed += int((overspeed(actions, self.settings) > 1).sum())
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
@@ -1174,10 +1196,6 @@ class Servo:
         with self.lock:
             self.broken_off = self.broken_off or bool(self.targets)
             self.targets = []
-
-    def too_fast(self, actions: np.ndarray) -> int:
-        """How many of the actions (n, 7) are faster than targets may move: they are cut short."""
-        return int((lengths(actions) * self.settings.policy_hz > self.speed).any(axis=1).sum())
 
     def go(self, pose: np.ndarray) -> None:
         """Goes straight to a pose (6,), at a quarter of a target's top speed; returns when there.
@@ -1239,7 +1257,7 @@ class Servo:
         period = 1 / self.settings.servo_hz
         due = time.monotonic()
         try:
-            while not self.ended.is_set() and self.error is None:
+            while self.error is None:
                 now = time.monotonic()
                 self.lateness.append(now - due)
                 self.step()
@@ -1260,7 +1278,7 @@ class Servo:
                 reason = f", but newer ones have arrived{self.describe_stall()}"
             else:
                 reason = ", and no newer one has arrived: look for the network or the controller"
-            raise RobotError(f"{error}{reason}") from error
+            raise RobotError(f"{error}{reason}{self.rtde.controller_said}") from error
         now = time.monotonic()
         if now - self.last_step[0] > MISSING_PACKAGES / settings.servo_hz:
             self.stall = self.describe_stall()
@@ -1353,7 +1371,6 @@ class Servo:
 
     def stop(self) -> None:
         """Ends the stream and the program on the controller, and warns if a program goes on."""
-        self.ended.set()
         self.fail("stopped")
         age = self.settings.max_state_age_s
         deadline = time.monotonic() + 1
@@ -1374,10 +1391,13 @@ class Servo:
                 f"{self.slowed} actions were faster than {metres:.2f} m/s, {radians:.2f} rad/s: "
                 "cut short"
             )
-        late = 1000 * np.array(self.lateness or [0.0])  # milliseconds
+        if not self.lateness:
+            return "nothing was sent: the stream had not begun"
+        late = 1000 * np.array(self.lateness)  # milliseconds
         oldest = 1000 * max(self.ages, default=0.0)
+        sent = "packages" if self.moves else "steps, in which nothing was sent,"
         return (
-            f"{len(self.lateness)} packages at {self.settings.servo_hz:g} Hz: late by "
+            f"{len(self.lateness)} {sent} at {self.settings.servo_hz:g} Hz: late by "
             f"{np.percentile(late, 50):.2f} ms (median), {np.percentile(late, 99):.2f} ms (99 %), "
             f"{late.max():.2f} ms (worst); oldest state {oldest:.1f} ms"
         )
@@ -1405,35 +1425,36 @@ class Cell:
     camera: RealSense | RecordedCamera
     activity: Activity
 
-    def observe(self, servo: Servo | None = None) -> Frame:
-        """The present observation.
-
-        If the camera gives none, `servo` holds the arm, and stops it after `max_hold_s`; without a
-        servo CameraError is raised. Before that, reading a RealSense may take up to a second, in
-        which the arm goes on with its chunk.
-        """
-        while True:
-            try:
-                with self.activity.during("reading the camera"):
-                    depth = self.camera.read()
-                with self.activity.during("sampling the cloud"):
-                    points, seen = cloud(depth, self.camera.intrinsics, self.settings)
-                break
-            except CameraError as error:
-                if servo is None:
-                    raise
-                servo.hold_reason = str(error)
-                servo.hold()
-                servo.check()
-                time.sleep(0.02)
-        if servo is not None:
-            servo.hold_reason = Servo.SLOW
+    def observe(self) -> Frame:
+        """The present observation. Raises CameraError if the camera gives no cloud."""
+        with self.activity.during("reading the camera"):
+            depth = self.camera.read()
+        with self.activity.during("sampling the cloud"):
+            points, seen = cloud(depth, self.camera.intrinsics, self.settings)
         pose = self.rtde.state(self.settings.max_state_age_s).pose
         pose[3:] = nearer(pose[3:], np.array(self.settings.rotation_near_rad))
         with self.activity.during("reading the gripper"):
             closed = self.gripper.read()
         state = np.append(pose, closed).astype(np.float32)
         return Frame(time=time.monotonic(), points=points, seen=seen, state=state)
+
+    def observe_or_hold(self, servo: Servo) -> Frame:
+        """`observe`, again and again while the camera gives no cloud.
+
+        Meanwhile `servo` holds the arm, and stops it after `max_hold_s`. Reading a RealSense may
+        take a second before it fails, in which the arm goes on with its chunk.
+        """
+        while True:
+            try:
+                frame = self.observe()
+            except CameraError as error:
+                servo.hold_reason = str(error)
+                servo.hold()
+                servo.check()
+                time.sleep(0.02)
+            else:
+                servo.hold_reason = Servo.SLOW
+                return frame
 
     def prepare(self, servo: Servo) -> None:
         """Raises RobotError if camera, gripper or arm are not ready; then initializes the gripper.
@@ -1442,36 +1463,30 @@ class Cell:
         not move the arm, the gripper does not move either.
         """
         self.observe()
-        try:
-            servo.check_start(self.rtde.state(self.settings.max_state_age_s))
-        except RobotError as error:
-            raise RobotError(f"the arm is not moved: {error}") from None
+        servo.check_start()
         if servo.moves:
             self.gripper.initialize()
 
-    def made_with(self, recording: Demonstrations | None = None) -> dict:
-        """What a recording's `meta` tells of the robot.
-
-        Raises UserError if `recording` was made with a robot of other settings.
-        """
+    def describe(self) -> dict:
+        """What a recording's `meta` tells of the robot."""
         settings = self.settings
         values = self.rtde.state(settings.max_state_age_s).values
-        now = {
+        return {
             "policy_hz": float(settings.policy_hz),
             "payload_kg": round(float(values["payload"]), 3),
             "tcp_offset": values["tcp_offset"].round(4).tolist(),
             "rotation_near_rad": [float(x) for x in settings.rotation_near_rad],
             "gripper_open_at": settings.gripper_open_at,
-            "workspace": boxes(settings)["workspace"],
+            **boxes(settings),
+            "positions_in_state": 1,
         }
-        if recording is not None:
-            check_same_robot(recording, now)
-        return {**now, **boxes(settings), "positions_in_state": 1}
 
 
-def check_same_robot(recording: Demonstrations, now: dict) -> None:
-    """Raises UserError for a value that the recording's `meta` has otherwise than it is now."""
-    for name, value in now.items():
+def check_same_robot(recording: Demonstrations, meta: dict) -> None:
+    """Raises UserError if `recording` was made with a robot that `meta` does not describe."""
+    for name, value in meta.items():
+        if name in ("tcp_box", "positions_in_state"):  # free to differ
+            continue
         recorded = recording.meta.get(name)
         same = same_tcp(recorded, value) if name == "tcp_offset" else recorded == value
         if not same:
@@ -1564,6 +1579,8 @@ def make_folder(out: Path) -> None:
         raise UserError(f"{out} cannot be written: {error.strerror}") from None
     if not os.access(out.parent, os.W_OK):
         raise UserError(f"{out} cannot be written: no permission to write to its folder")
+    if out.is_dir():
+        raise UserError(f"{out} cannot be written: it is a folder, name a file")
 
 
 def save(out: Path, recording: Demonstrations) -> Demonstrations:
@@ -1616,24 +1633,24 @@ def run(args: argparse.Namespace, settings: Settings) -> None:
     with torch.no_grad():
         context = policy.encode_demo(text.to(args.device), **demo)
 
-    def act(frames: list[Frame]) -> np.ndarray | None:
-        seconds = frames[-1].time - frames[0].time
-        if not seconds < args.seconds:  # in this form NaN ends it at once, too
-            return None
-        padded = [frames[0]] * config.n_obs_steps + frames
-        observed = padded[-config.n_obs_steps :]  # To frames
-        points = torch.tensor(np.stack([frame.points for frame in observed]))[None]
-        points = points[:, :, : config.num_points].to(args.device)  # (1, To, N, 3)
-        state = torch.tensor(np.stack([frame.state for frame in observed]))[None]
-        state = state.to(args.device)  # (1, To, S)
-        try:
-            actions = policy.sample_actions(points, state, context, generator)  # (1, Ta, A)
-        except Exception as error:
-            raise RobotError(f"the policy failed: {error!r}") from error
-        return actions[0].cpu().numpy()
-
     warm_up(policy, context, settings, args.device)
-    drive(args, settings, recording, act=act, start=settings.start_pose)
+    with driving(args, settings, recording, start=settings.start_pose) as (cell, servo, log):
+        while log.seconds() < args.seconds:
+            with cell.activity.during("computing actions"):
+                newest = log.frames[-config.n_obs_steps :]
+                observed = [newest[0]] * (config.n_obs_steps - len(newest)) + newest  # To frames
+                points = torch.tensor(np.stack([frame.points for frame in observed]))[None]
+                points = points[:, :, : config.num_points].to(args.device)  # (1, To, N, 3)
+                state = torch.tensor(np.stack([frame.state for frame in observed]))[None]
+                state = state.to(args.device)  # (1, To, S)
+                try:
+                    actions = policy.sample_actions(points, state, context, generator)
+                except Exception as error:
+                    raise RobotError(f"the policy failed: {error!r}") from error
+                chunk = actions[0].cpu().numpy()  # (Ta, A)
+            if args.dry_run:
+                servo.begin_here()  # the policy sees that the arm has not moved
+            execute(chunk, cell, servo, log)
 
 
 def warm_up(policy: model.DAMIPolicy, context: Any, settings: Settings, device: str) -> None:
@@ -1660,8 +1677,7 @@ def at_allowed_speed(actions: np.ndarray, settings: Settings) -> np.ndarray:
 
     The way remains the same, and the gripper's place on it; only the time is longer.
     """
-    parts = np.ceil((lengths(actions) * settings.policy_hz / settings.target_speed).max(axis=1))
-    parts = parts.clip(1).astype(int)  # (T,)
+    parts = np.ceil(overspeed(actions, settings)).clip(1).astype(int)  # (T,)
     divided = actions.copy()
     divided[:, :6] /= parts[:, None]
     return np.repeat(divided, parts, axis=0)
@@ -1684,19 +1700,31 @@ def replay(args: argparse.Namespace, settings: Settings) -> None:
             f"{len(recorded)} actions take the time of {len(actions)}: some were faster than the "
             "arm may go"
         )
-    chunks = iter(np.array_split(actions, math.ceil(len(actions) / 8)))
     start = recording.state[frames.start, :6].tolist()
-    drive(args, settings, recording, act=lambda _: next(chunks, None), start=start)
+    with driving(args, settings, recording, start=start) as (cell, servo, log):
+        for chunk in np.array_split(actions, math.ceil(len(actions) / 8)):
+            execute(chunk, cell, servo, log)
+            if servo.broken_off:
+                raise RobotError("camera or gripper were late: the rest would begin elsewhere")
 
 
 @dataclass
 class Log:
-    """What was seen and done since the start; `drive` writes it in the end."""
+    """What was seen and done since the start; `driving` writes it in the end.
+
+    Where the rest of a chunk was left out, the arm may have gone further than the last action says.
+    The log's episode ends there, and what is seen next begins another.
+    """
 
     frames: list[Frame] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)  # (7,)
+    breaks: list[int] = field(default_factory=list)  # after so many actions a chunk was broken off
     commanded: list[list[float]] = field(default_factory=list)  # the pose (6,) before each action
     ended: str = "done"  # or the reason
+
+    def seconds(self) -> float:
+        """From the first frame to the newest one."""
+        return self.frames[-1].time - self.frames[0].time
 
     def write(self, out: Path, recording: Demonstrations, meta: dict) -> None:
         """Writes whole steps, a frame and its action, in the format of recordings."""
@@ -1708,28 +1736,27 @@ class Log:
             self.actions[:count],
             task=recording.task,
             instruction=recording.instruction,
-            meta={**meta, "commanded": self.commanded, "ended": self.ended},
+            meta={**meta, "commanded": self.commanded[:count], "ended": self.ended},
         )
+        ends = sorted({count, *(end for end in self.breaks if end < count)})
         try:
-            save(out, done)
+            save(out, replace(done, episode_ends=np.array(ends)))
             print(f"wrote {out}")
         except (UserError, RecordingError) as error:
             warn(str(error))
 
 
-def drive(
+@contextmanager
+def driving(
     args: argparse.Namespace,
     settings: Settings,
     recording: Demonstrations,
-    *,
-    act: Callable[[list[Frame]], np.ndarray | None],
     start: Sequence[float] | None,
-) -> None:
-    """Executes the chunks (Ta, 7) that `act` makes of all frames seen, until it returns None.
+) -> Iterator[tuple[Cell, Servo, Log]]:
+    """Connects to the robot, goes to the pose `start`, if any, and stops the arm at the end.
 
-    If the camera is late or fails, or the gripper is late, the rest of a chunk is left out; a
-    gripper that fails ends the run. However this ends, frames and actions are written to a file in
-    the format of recordings; only a second Ctrl-C may prevent that.
+    The block inside executes chunks of actions by `execute`. However it ends, frames and actions
+    are written to a file in the format of recordings; only a second Ctrl-C may prevent that.
     """
     name = f"{recording.task}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.npz"
     out = Path(args.out or f"runs/robot/{name}")
@@ -1738,8 +1765,10 @@ def drive(
     make_folder(out)
     log = Log()
     with connect(args, settings, write=not args.dry_run) as cell:
-        meta = {**cell.made_with(recording), "made_by": f"robot.{args.command}"}
-        servo = Servo(cell.rtde, settings, moves=not args.dry_run, activity=cell.activity)
+        meta = cell.describe()
+        check_same_robot(recording, meta)
+        meta["made_by"] = f"robot.{args.command}"
+        servo = Servo(cell.rtde, settings, activity=cell.activity)
         try:
             cell.prepare(servo)
             servo.start(args.host)
@@ -1748,17 +1777,8 @@ def drive(
                 metres, radians = distance(servo.pose, np.array(start))
                 print(f"going to the start, {metres:.2f} m and {radians:.2f} rad away", flush=True)
                 servo.go(np.array(start))
-            log.frames.append(cell.observe(servo))
-            while True:
-                with cell.activity.during("computing actions"):
-                    chunk = act(log.frames)
-                if chunk is None:
-                    break
-                if args.dry_run and args.command == "run":
-                    servo.begin_here()  # the policy sees that the arm has not moved
-                execute(chunk, cell, servo, log)
-                if servo.broken_off and args.command == "replay":
-                    raise RobotError("camera or gripper were late: the rest would begin elsewhere")
+            log.frames.append(cell.observe_or_hold(servo))
+            yield cell, servo, log
         except BaseException as error:  # Ctrl-C, too
             log.ended = str(error) or type(error).__name__
             raise
@@ -1769,14 +1789,18 @@ def drive(
 
 
 def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
-    """Executes the actions (Ta, 7) of a chunk; logs them, and what is seen after each."""
+    """Executes the actions (Ta, 7) of a chunk; logs them, and what is seen after each.
+
+    If the camera is late or fails, or the gripper is late, the rest of the chunk is left out, and
+    `servo.broken_off` is set; a gripper that fails raises RobotError.
+    """
     period = 1 / servo.settings.policy_hz
     servo.follow(chunk)
     began = time.monotonic()
     for step, action in enumerate(chunk, start=1):
+        servo.check()
         log.actions.append(action)
         log.commanded.append(servo.pose.tolist())
-        servo.check()
         if servo.moves:
             with cell.activity.during("moving the gripper"):
                 cell.gripper.move(action[6])
@@ -1785,11 +1809,13 @@ def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
             servo.check()
             time.sleep(max(0.0, min(due - time.monotonic(), 0.02)))
         servo.check()
-        log.frames.append(cell.observe(servo))
+        log.frames.append(cell.observe_or_hold(servo))
+        servo.check()  # why the arm was stopped comes before "late"
         late = time.monotonic() - due
         if step < len(chunk) and late > period:
-            servo.hold()  # the arm has gone on, so the gripper's next action is late for its place
+            servo.hold()  # the arm moved on meanwhile: the gripper would act in the wrong place
         if servo.broken_off:
+            log.breaks.append(len(log.actions))
             return
 
 
@@ -1807,17 +1833,12 @@ class Keys:
             raise UserError("standard input is closed: use a terminal, or write the keys into it")
         self.terminal = sys.stdin.isatty()
         if self.terminal:
-            import termios  # Windows has neither
-            import tty
-
             self.attributes = termios.tcgetattr(sys.stdin)
             tty.setcbreak(sys.stdin)
         return self
 
     def __exit__(self, *_: Any) -> None:
         if self.terminal:
-            import termios
-
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self.attributes)
 
     def pressed(self) -> str:
@@ -1886,7 +1907,7 @@ class Recorder:
             self.frames = None
             print("dropped", flush=True)
         elif key == "e" and self.frames:
-            self.keep(servo)
+            self.keep()
             self.frames = None
 
     def observe(self) -> None:
@@ -1895,7 +1916,7 @@ class Recorder:
             self.frames.append(self.cell.observe())
             self.grip.append(self.closed)
 
-    def keep(self, servo: Servo) -> None:
+    def keep(self) -> None:
         """Writes the recorded episode behind the others, if `run` could execute it."""
         try:
             actions = episode_actions(self.frames, self.grip, self.cell.settings)
@@ -1913,8 +1934,9 @@ class Recorder:
             )
             self.kept = save(self.out, recording)
         self.count += 1
+        too_fast = int((overspeed(actions, self.cell.settings) > 1).sum())
         print(
-            f"episode {self.count}: {len(self.frames)} frames, {servo.too_fast(actions)} of them "
+            f"episode {self.count}: {len(self.frames)} frames, {too_fast} of them "
             f"faster than targets may move; saved in {self.out}",
             flush=True,
         )
@@ -1926,10 +1948,12 @@ def record(args: argparse.Namespace, settings: Settings) -> None:
     The keys are those of the terminal. Where standard input is no terminal, they are read from it,
     as a script or a foot pedal writes them, and its end means q.
     """
-    if not TERMINAL_ERRORS:
+    if termios is None:
         raise UserError("record reads keys as POSIX systems do: use Linux or macOS")
     if not re.fullmatch(data.NAME, args.task):
         raise UserError(f"--task {args.task!r}: use letters, digits, '-', '_' and '.'")
+    if args.episodes < 1:
+        raise UserError(f"--episodes is {args.episodes}: use at least 1")
     out = Path(args.out or f"demos/{args.task}.npz")
     if out.exists() and not args.append:
         raise UserError(f"{out} exists: add --append, move it, or give another --out")
@@ -1951,8 +1975,11 @@ def record_episodes(
     """`record`, behind the episodes that the file holds already."""
     moves = not args.dry_run
     with connect(args, settings, write=moves) as cell, Keys() as keys:
-        meta = {**cell.made_with(kept), "made_by": "robot.record", "camera": args.camera}
-        servo = Servo(cell.rtde, settings, moves=moves, free=True, activity=cell.activity)
+        meta = cell.describe()
+        if kept is not None:
+            check_same_robot(kept, meta)
+        meta |= {"made_by": "robot.record", "camera": args.camera}
+        servo = Servo(cell.rtde, settings, free=True, activity=cell.activity)
         cell.prepare(servo)
         recorder = Recorder(args=args, cell=cell, out=out, meta=meta, kept=kept)
         closed = cell.gripper.read()
@@ -1980,7 +2007,9 @@ def record_episodes(
         except RobotError as error:
             kept = recorder.kept
             before = f"{len(kept)} are in {out}" if kept else "none was kept before"
-            raise RobotError(f"{error}; the episode at hand is dropped, {before}") from error
+            if recorder.frames is not None:
+                before = f"the episode at hand is dropped, {before}"
+            raise RobotError(f"{error}; {before}") from error
         finally:
             servo.stop()
     kept = recorder.kept
@@ -1992,8 +2021,8 @@ def record_episodes(
 
 def check(args: argparse.Namespace, settings: Settings) -> None:
     """Connects to everything, moves nothing, and says what is there."""
-    if args.picture and not Path(args.picture).parent.is_dir():
-        raise UserError(f"--picture is {args.picture}: its folder does not exist")
+    if args.picture:
+        make_folder(Path(args.picture))
     asked = ("robotmode", "safetystatus", "programState", "is in remote control")
     try:
         answers = dashboard(args.host, settings.dashboard_port, *asked)
@@ -2023,9 +2052,14 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
         except CameraError as error:
             box = f"none: {error}"
             trouble = trouble or str(error)
+        try:
+            gripper_state = cell.gripper.read_register(INITIALIZED)
+            gripper = f"{cell.gripper.read():.2f} (0 open, 1 closed), state {gripper_state}"
+        except RobotError as error:
+            gripper = f"none: {error}"
+            trouble = trouble or str(error)
         version = ".".join(map(str, cell.rtde.version))
-        gripper_state = cell.gripper.exchange(READ, INITIALIZED, 1)
-        meta = cell.made_with()
+        meta = cell.describe()
         rows = {
             **answers,
             "controller": f"software {version}, robot mode {state.values['robot_mode']}, "
@@ -2033,7 +2067,7 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
             "TCP, m and rad": " ".join(f"{x:.3f}" for x in state.pose),
             "state": trouble or "ready",
             "recorded with": meta,
-            "gripper": f"{cell.gripper.read():.2f} (0 open, 1 closed), state {gripper_state}",
+            "gripper": gripper,
             "depth": f"in {np.count_nonzero(depth) / max(1, depth.size):.0%} of {depth.shape[1]} x "
             f"{depth.shape[0]} pixels",
             "points": box,
@@ -2041,10 +2075,16 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
     for name, value in rows.items():
         print(f"{name:22}{value}")
     if args.picture and len(points) > 0:
-        frame = Frame(
-            time=0.0, points=thin(points), seen=len(kept), state=np.append(state.pose, 0.0)
+        snapshot = Demonstrations(
+            task="check",
+            instruction="the robot's base frame",
+            points=thin(points)[None].astype(np.float16),  # (1, M, 3)
+            state=np.append(state.pose, 0.0)[None],  # (1, 7)
+            action=np.zeros((1, ACTION_DIM)),
+            episode_ends=np.array([1]),
+            meta=meta,
         )
-        plot_cell(args.picture, frame, meta)
+        report.plot_demonstration(snapshot, args.picture)
         print(f"wrote {args.picture}")
     if trouble:
         raise RobotError(f"not ready: {trouble}")
@@ -2057,32 +2097,18 @@ def check_reference(pose: np.ndarray, settings: Settings) -> None:
     makes the other one the nearer.
     """
     reference = np.array(settings.rotation_near_rad)
-    near = nearer(pose[3:], reference)
-    angle = np.linalg.norm(near)
-    if angle == 0:
+    if not pose[3:].any():  # no rotation: there is no other vector
         return
-    other = near * (1 - 2 * np.pi / angle)
-    if np.linalg.norm(other - reference) - np.linalg.norm(near - reference) < 1.5:
+    both = (pose[3:], other_rotvec(pose[3:]))
+    near, far = sorted(np.linalg.norm(rotvec - reference) for rotvec in both)
+    if far - near < 1.5:
         raise RobotError(f"the rotation vector may flip: {write_rotation(pose[3:])}")
-
-
-def plot_cell(path: str, frame: Frame, meta: dict) -> None:
-    """Draws a frame's points and TCP, and the boxes that `meta` names."""
-    recording = to_recording(
-        [frame],
-        np.zeros((1, ACTION_DIM)),
-        task="check",
-        instruction="the robot's base frame",
-        meta=meta,
-    )
-    report.plot_demonstration(recording, path)
 
 
 def record_camera(args: argparse.Namespace) -> None:
     """Records depth images to a file that --camera replays."""
     out = Path(args.out)
-    if not out.parent.is_dir():
-        raise UserError(f"--out is {out}: its folder does not exist")
+    make_folder(out)
     if args.frames < 1:
         raise UserError(f"--frames is {args.frames}: use at least 1")
     camera = RecordedCamera(args.camera) if args.camera else RealSense()

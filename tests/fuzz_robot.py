@@ -90,13 +90,14 @@ def fuzz_robot(seed: int, rounds: int = 8) -> tuple[list[float], list[float], st
 
 
 class SimulatedArm:
-    """An arm that a `robot.Servo` moves, and the clock of both: what they need of `time` and RTDE.
+    """An arm that a `robot.Servo` moves; it also replaces `time` and the RTDE connection for both.
 
     The arm follows what was sent last as servoj does, behind by its lookahead time. It has no
     sockets, and no thread: to sleep is to let both go on for so long.
     """
 
     controller_said = ""
+    writes = True
 
     def __init__(self, settings: robot.Settings, pose: np.ndarray) -> None:
         self.settings, self.pose, self.sent, self.count = settings, pose, pose, 0
