@@ -66,8 +66,8 @@ from data import (
     save_demonstrations,
     suspicions,
 )
+from geometry import depth_to_points, has_depth, is_pose, thin, transform
 from report import plot_demonstration
-from robot import depth_to_points, has_depth, is_pose, thin, transform
 
 
 def refuse(path: Any, problem: str) -> NoReturn:

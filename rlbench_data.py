@@ -39,7 +39,7 @@ import numpy as np
 import PIL.Image
 
 from data import RecordingError
-from robot import compose, depth_to_points, difference, nearer, quaternion, thin, transform
+from geometry import compose, depth_to_points, difference, nearer, quaternion, thin, transform
 
 CAMERAS = ("front", "left_shoulder", "right_shoulder")
 WRIST = "wrist"  # one camera more, where it is asked for
@@ -143,7 +143,7 @@ def read_view(where: Path | str, misc: Mapping[str, Any], camera: str, depth: np
 def seen_points(
     views: Sequence[View], workspace: Sequence[Sequence[float]] = WORKSPACE
 ) -> np.ndarray:
-    """What all cameras see of the workspace, (M, 3) float32, thinned as `robot.thin` does.
+    """What all cameras see of the workspace, (M, 3) float32, thinned as `geometry.thin` does.
 
     A cloud is made of these by `data.farthest_point_sample`.
     """

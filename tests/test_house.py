@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 FILES = re.findall(r"^\| `(\w+)\.py` \|", README, re.M)
-ALONE = ("model", "clip", "maml", "data", "camera", "common")
+ALONE = ("model", "clip", "maml", "data", "camera", "geometry", "common")
 
 
 def imported(name):
@@ -52,3 +52,4 @@ def test_what_needs_no_simulator_imports_none():
 
     for name in ("robot", "convert"):
         assert not reached(name) & {"simulator", "metaworld_env", "camera", "evaluate"}
+    assert not reached("convert") & {"robot", "model"}

@@ -24,8 +24,8 @@ import rlbench_data
 import rlbench_env
 import simulator
 from data import RecordingError, load_demonstrations
+from geometry import SAMPLED_FROM
 from model import PRESETS
-from robot import SAMPLED_FROM
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 RNG = np.random.default_rng(0)

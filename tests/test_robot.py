@@ -30,6 +30,7 @@ import clip
 import common
 import convert
 import data
+import geometry
 import model
 import report
 import robot
@@ -326,7 +327,7 @@ def test_rotations_compose_as_scipys_do_near_0_and_near_pi_too():
             first, second = rng.normal(size=(2, 3))
             first *= size / np.linalg.norm(first)
             theirs = Rotation.from_rotvec(second) * Rotation.from_rotvec(first)
-            for both in (robot.rotate(first, second), turned(first, second)):
+            for both in (geometry.rotate(first, second), turned(first, second)):
                 assert (Rotation.from_rotvec(both) * theirs.inv()).magnitude() < 1e-9
                 assert np.linalg.norm(both) < np.pi + 1e-12
 
@@ -1040,7 +1041,7 @@ def test_a_large_depth_image_is_thinned_out_before_it_is_sampled(monkeypatch):
     settings = Settings(**BOXES | {"camera_to_base": CAMERA_TO_BASE}, num_points=256)
     points, _ = robot.cloud(depth, (600.0, 600.0, 320.0, 240.0), settings)
     everything, _ = robot.cloud(depth[::8, ::8], (75.0, 75.0, 40.0, 30.0), settings)
-    assert sizes[0] <= robot.SAMPLED_FROM < depth.size
+    assert sizes[0] <= geometry.SAMPLED_FROM < depth.size
     np.testing.assert_allclose(points.min(0), everything.min(0), atol=0.02)
     np.testing.assert_allclose(points.max(0), everything.max(0), atol=0.02)
 
