@@ -9,10 +9,11 @@
 All but the last need --host ADDRESS, the robot's. Without an arm, `python -m tests.emulator`
 emulates one at 127.0.0.1. With --dry-run nothing is made to move.
 
-One action, from the network to the arm: `run` draws a chunk with `DAMIPolicy.sample_actions`,
-`Servo.follow` makes target poses of it, `Servo.tick` interpolates to 125 Hz and limits the speed,
-`RTDE.send` packs the bytes; on the controller `PROGRAM` reads the pose from registers and calls
-servoj.
+One action, from the camera to the arm: `Cell.observe` takes a frame, `run` draws a chunk of actions
+by `DAMIPolicy.sample_actions`, and `execute` passes it to `Servo.follow`, which makes target poses.
+In a thread, 125 times a second, `Servo.step` checks the arm, interpolates and limits the speed
+(`Servo.tick`), and never sends a pose that is further ahead of the arm than allowed. `RTDE.send`
+packs the bytes; on the controller `PROGRAM` reads the pose from registers and calls servoj.
 
 Poses are (x, y, z, rx, ry, rz): metres and axis-angle radians of the tool center point (TCP) in the
 robot's base frame. State (7,): TCP pose, gripper. Action (7,): dx, dy, dz in metres, drx, dry, drz
@@ -119,7 +120,7 @@ class Settings:
 
     The first five have no default, because they depend on where the arm is mounted. Raises
     ValueError, in one line, for a value of the wrong type, out of range, or at odds with another.
-    `check_steps` and `check_poses` tell whether the arm may do what it is to do.
+    Every motion is checked by `check_steps` and `check_poses` before it is sent.
     """
 
     tcp_low_m: tuple = setting(MISSING, "lower corner of the box that the TCP stays in", **CORNER)
@@ -149,13 +150,15 @@ class Settings:
         0.2, "stops if it is turned farther from its target", least=0.001, most=3.0
     )
     max_hold_s: float = setting(
-        2.0, "stops if no new actions come for so long", least=0.01, most=60
+        2.0, "stops if no new actions come for this long", least=0.01, most=60
     )
     servo_lookahead_s: float = setting(
         0.1, "lookahead time of servoj, which smooths", least=0.03, most=0.2
     )
     servo_gain: float = setting(300.0, "gain of servoj", least=100, most=2000)
-    gripper_serial: str | None = setting(None, "such as /dev/ttyUSB0; null: gripper_port of --host")
+    gripper_serial: str | None = setting(
+        None, "serial port of the gripper, such as /dev/ttyUSB0; null: gripper_port of --host"
+    )
     gripper_slave: int = setting(1, "Modbus address of the gripper", least=1, most=247)
     gripper_open_at: int = setting(1000, "per mille where it is open", choices=(0, 1000))
     gripper_force_percent: int = setting(30, "gripping force", least=20, most=100)
@@ -189,9 +192,9 @@ class Settings:
 
     @property
     def lead(self) -> np.ndarray:
-        """How far a pose that is sent is ahead of the measured one at most, see `Servo`: (2,).
+        """The most that a sent pose may be ahead of the measured one (2,), metres and radians.
 
-        Metres and radians.
+        `Servo` says why.
         """
         return np.array([self.max_speed_m_s, self.max_speed_rad_s]) * self.servo_lookahead_s
 
@@ -287,7 +290,7 @@ def load_settings(path: str | Path) -> Settings:
 HEADER = struct.Struct(">HB")  # size of the whole package, type
 REQUEST_PROTOCOL, REQUEST_CONTROLLER = ord("V"), ord("v")
 SETUP_OUTPUTS, SETUP_INPUTS, START, DATA, MESSAGE = map(ord, "OISUM")
-OLDEST = (5, 5, 1)  # of the controller's software: the first of an e-Series that tells `tcp_offset`
+OLDEST = (5, 5, 1)  # the first software of an e-Series' controller that reports `tcp_offset`
 FORMATS = {"INT32": ">i4", "UINT32": ">u4", "DOUBLE": ">f8", "VECTOR6D": "(6,)>f8"}  # for numpy
 OUTPUTS = (
     "timestamp",
@@ -303,9 +306,9 @@ OUTPUTS = (
     "output_int_register_24",  # the session that our program belongs to
     "output_int_register_25",  # the number of the package that our program followed last
 )
-# Registers 0 to 23 belong to the fieldbus. Every package holds its number, the pose to go to, the
-# session's number (or STOP), and its number once more: where the two differ, the program has met a
-# package that is only half written.
+# Registers 0 to 23 belong to the fieldbus. A package is its number, the pose to go to, the number
+# of the session (or STOP), and its own number again. Where its two numbers differ, the program has
+# read while the package was being written.
 POSE = tuple(f"input_double_register_{24 + i}" for i in range(6))
 INPUTS = ("input_int_register_25", *POSE, "input_int_register_24", "input_int_register_26")
 STOP = 0  # in the place of the session's number: the program ends
@@ -419,7 +422,7 @@ class RTDE:
             raise self.lost("it does not start sending")
 
     def lost(self, what: str) -> RobotError:
-        """The error to raise: it names the controller, and ends with what that said last."""
+        """Makes an error, which names the address and ends with the controller's last message."""
         return RobotError(f"{self.name}: {what}{self.controller_said}")
 
     def recipe(self, reply: bytes, names: Sequence[str]) -> tuple[bytes, np.dtype]:
@@ -438,7 +441,7 @@ class RTDE:
         return reply[:1], np.dtype([(name, FORMATS[kind]) for name, kind in zip(names, types)])
 
     def package(self) -> tuple[int, bytes]:
-        """The type and payload of the next package that is no text message; those are kept."""
+        """The type and payload of the next package. Text messages are skipped; errors quote one."""
         while True:
             kind, payload = self.any_package()
             if kind != MESSAGE:
@@ -614,8 +617,8 @@ def port_of(host: str, port: int, what: str) -> Iterator[socket.socket]:
 def upload(host: str, port: int, text: str, waiting: Callable = lambda: None) -> None:
     """Sends a URScript program; the controller ends the one that runs and starts this one.
 
-    While the port has not answered, `waiting` is called again and again, to write the poses without
-    which the watchdog would end the program, which may run already.
+    The program may run before the port has answered, and its watchdog then expects poses: `waiting`
+    is called again and again to send them.
     """
     with port_of(host, port, "the script port") as connection:
         connection.sendall(text.encode())
@@ -686,7 +689,7 @@ class Gripper:
     """An AG95: frames of Modbus RTU over a serial port, 115200 8N1, or a serial bridge on TCP.
 
     Raises UserError without pyserial, where a serial port is named, and RobotError if the gripper
-    cannot be reached, or after ATTEMPTS faults of one exchange: within about 2 s.
+    cannot be reached, or if an exchange has failed ATTEMPTS times, which takes about 2 s.
     """
 
     ATTEMPTS = 3  # each may end in a time-out, a bad check sum or an exception; then RobotError
@@ -749,7 +752,7 @@ class Gripper:
         raise RobotError(f"the gripper at {self.where}: {problem}")
 
     def initialize(self, timeout: float = 10.0) -> None:
-        """Initializes a gripper that is not, which opens and closes it; then sets the force."""
+        """Initializes the gripper, if it is not, which opens and closes it; then sets the force."""
         if self.read_register(INITIALIZED) != 1:
             print("the gripper is initialized: it opens and closes", flush=True)
             self.write_register(INITIALIZE, 1)
@@ -802,7 +805,9 @@ def crop(points: np.ndarray, settings: Settings) -> np.ndarray:
 def cloud(
     depth: np.ndarray, intrinsics: Sequence[float], settings: Settings
 ) -> tuple[np.ndarray, int]:
-    """Depth (H, W), metres -> the policy's points (N, 3) float32, base frame; from how many.
+    """Depth (H, W), metres -> the policy's points (N, 3) float32, base frame, and a number.
+
+    The number is that of the points in the crop box, before sampling.
 
     The points in the crop box are farthest point sampled. Fewer than N are repeated, and more than
     SAMPLED_FROM are thinned before: sampling holds Python's lock, so that no other thread runs, and
@@ -947,8 +952,8 @@ class Servo:
     holds the last target when all are reached. With `free` it only keeps the arm free to be moved
     by hand. It stops for good, and says why, when
 
-    - the newest state is older than `max_state_age_s`, or states take longer to arrive, by as much,
-      than the quickest one did; the connection or its framing is lost; the controller's clock
+    - the newest state is older than `max_state_age_s`, or took longer by as much to arrive than the
+      quickest one did; the connection or its framing is lost; the controller's clock
       stands still or runs backwards;
     - the robot is not running, its safety mode is neither normal nor reduced, its speed slider is
       not at 100 %, or our program is paused, has ended, or has been replaced by another;
@@ -967,7 +972,7 @@ class Servo:
 
     PATIENCE = 5.0  # seconds for the program to start
     REACHED = 1e-6  # metres and radians: a target that is nearer has been reached
-    STANDS = 1e-7  # metres and radians: a step of the slowest arm allowed is ten times as long
+    STANDS = 1e-7  # metres and radians: even the slowest arm allowed goes further in a step
     SLOW = "the policy or the camera is too slow"
 
     def __init__(
@@ -991,7 +996,8 @@ class Servo:
         self.lock = threading.Lock()  # of the targets
         self.error: str | None = None  # why the arm was stopped
         self.counters: dict[str, tuple[float, float]] = {}  # name -> its value, and since when
-        # The least delay of all states. To all delays a constant is added, which does not matter.
+        # The smallest difference between the arrival of a state and its time stamp. The two clocks
+        # began at different times, so only differences of delays mean anything.
         self.least_delay = math.inf
         self.last_step = (time.monotonic(), time.process_time())  # of the stream
         self.stall = ""  # why the stream stood still for so long that the watchdog may have struck
@@ -1074,7 +1080,7 @@ class Servo:
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
-        """Inside, an error stops the arm, and is raised; so is that of an arm stopped before."""
+        """Raises why the arm was stopped, before and after the block; an error inside stops it."""
         self.check()
         try:
             yield
@@ -1083,7 +1089,7 @@ class Servo:
         self.check()
 
     def begin_here(self) -> None:
-        """Lets the next actions begin where the arm is, which a dry run does not move."""
+        """Sets the commanded pose to the measured one: in a dry run the arm stays where it is."""
         with self.lock:
             self.pose = self.rtde.state(self.settings.max_state_age_s).pose
             self.targets = []
@@ -1146,7 +1152,7 @@ class Servo:
                 if when <= now and distance(self.pose, target).max() < self.REACHED:
                     self.targets = []
                 if when > now or distance(self.pose, before).max() > self.STANDS:
-                    self.held_since = now  # on its way: overdue perhaps, but coming nearer
+                    self.held_since = now  # it still moves, even if its target was due earlier
             return self.pose
 
     def stream(self) -> None:
@@ -1417,7 +1423,7 @@ def boxes(settings: Settings) -> dict:
 def connect(args: argparse.Namespace, settings: Settings, write: bool) -> Iterator[Cell]:
     """Camera, gripper and arm; whatever was opened is closed again."""
     if args.camera and write and args.host not in ("localhost", "127.0.0.1"):
-        raise UserError("--camera shows an arm what was long ago: leave it out, or add --dry-run")
+        raise UserError("--camera shows an arm what was recorded: leave it out, or add --dry-run")
     with ExitStack() as stack:
         camera = RecordedCamera(args.camera) if args.camera else RealSense()
         stack.callback(camera.close)
@@ -1492,119 +1498,6 @@ def save(out: Path, recording: Demonstrations) -> Demonstrations:
 # ---- The policy's loop ---------------------------------------------------------------------------
 
 
-def run(args: argparse.Namespace, settings: Settings) -> None:
-    """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and so on."""
-    common.pick_device(args.device)
-    checkpoint = Path(args.checkpoint)
-    if checkpoint.is_dir():
-        checkpoint = checkpoint / "adapted.pt"
-    policy, info = model.load(checkpoint, args.device, needs=("text_weights",))
-    config = policy.config
-    if (config.state_dim, config.action_dim) != (STATE_DIM, ACTION_DIM):
-        raise UserError(
-            f"{args.checkpoint} has states of {config.state_dim} and actions of "
-            f"{config.action_dim} numbers, this robot {STATE_DIM} and {ACTION_DIM}: use a policy "
-            "trained on its recordings"
-        )
-    if config.point_dim != 3:
-        raise UserError(
-            f"{args.checkpoint} reads points of {config.point_dim} numbers, this robot sees "
-            "positions alone: use a policy trained on its recordings"
-        )
-    if config.num_points > settings.num_points:
-        raise UserError(
-            f"{args.checkpoint} reads {config.num_points} points, num_points of the settings is "
-            f"{settings.num_points}: raise it"
-        )
-    recording = data.load_demonstrations(args.data)
-    task = info.get("adapted_to", recording.task)
-    if task != recording.task:
-        raise UserError(f"{args.checkpoint} was adapted to {task}, {args.data} is of another task")
-    sampler = data.WindowSampler(recording, config, device=args.device)
-    text, _ = text_features([recording.instruction], args.clip_weights, info["text_weights"])
-    if not info.get("adaptation", {}).get("instruction", True):  # adapted without it
-        text = torch.zeros_like(text)
-    torch.set_num_threads(max(1, common.usable_cores() - 1))  # a core is left to the servo stream
-    generator = torch.Generator().manual_seed(args.seed)
-    demo = sampler.demonstration(sampler.sample_episode(generator))  # held for the whole run
-    with torch.no_grad():
-        context = policy.encode_demo(text.to(args.device), **demo)
-
-    warm_up(policy, context, settings, args.device)
-    with driving(args, settings, recording, start=settings.start_pose) as (cell, servo, log):
-        while log.seconds() < args.seconds:
-            with cell.activity.during("computing actions"):
-                newest = log.frames[-config.n_obs_steps :]
-                observed = [newest[0]] * (config.n_obs_steps - len(newest)) + newest  # To frames
-                points = torch.tensor(np.stack([frame.points for frame in observed]))[None]
-                points = points[:, :, : config.num_points].to(args.device)  # (1, To, N, 3)
-                state = torch.tensor(np.stack([frame.state for frame in observed]))[None]
-                state = state.to(args.device)  # (1, To, S)
-                try:
-                    actions = policy.sample_actions(points, state, context, generator)
-                except Exception as error:
-                    raise RobotError(f"the policy failed: {error!r}") from error
-                chunk = actions[0].cpu().numpy()  # (Ta, A)
-            if args.dry_run:
-                servo.begin_here()  # the policy sees that the arm has not moved
-            execute(chunk, cell, servo, log)
-
-
-def warm_up(policy: model.DAMIPolicy, context: Any, settings: Settings, device: str) -> None:
-    """Draws two chunks before an arm waits for them: on a GPU the first may take seconds.
-
-    Raises UserError if the second takes longer than the arm may wait.
-    """
-    config = policy.config
-    points = torch.zeros(1, config.n_obs_steps, config.num_points, 3, device=device)
-    state = torch.zeros(1, config.n_obs_steps, config.state_dim, device=device)
-    for _ in range(2):
-        began = time.monotonic()
-        policy.sample_actions(points, state, context, torch.Generator().manual_seed(0)).cpu()
-        seconds = time.monotonic() - began
-    if seconds > settings.max_hold_s:
-        raise UserError(
-            f"the policy takes {seconds:.1f} s for a chunk, and max_hold_s is "
-            f"{settings.max_hold_s:g}: use a faster computer or a smaller policy"
-        )
-
-
-def at_allowed_speed(actions: np.ndarray, settings: Settings) -> np.ndarray:
-    """Divides each action (T, 7) that is faster than targets may move into equal parts, (n, 7).
-
-    The way remains the same, and the gripper's place on it; only the time is longer.
-    """
-    parts = np.ceil(overspeed(actions, settings)).clip(1).astype(int)  # (T,)
-    divided = actions.copy()
-    divided[:, :6] /= parts[:, None]
-    return np.repeat(divided, parts, axis=0)
-
-
-def replay(args: argparse.Namespace, settings: Settings) -> None:
-    """Goes slowly to where a recorded episode began, and executes its actions."""
-    recording = data.load_demonstrations(args.data)
-    dims = recording.state.shape[1], recording.action.shape[1]
-    if dims != (STATE_DIM, ACTION_DIM):
-        raise UserError(f"{args.data} has {dims} dimensions of state and action: of another robot")
-    if not 0 <= args.episode < len(recording):
-        raise UserError(f"{args.data} has {len(recording)} episodes: no --episode {args.episode}")
-    frames = recording.episode(args.episode)
-    recorded = recording.action[frames]  # (T, A)
-    settings.check_steps(recorded)  # divided into parts, a jump would be none
-    actions = at_allowed_speed(recorded, settings)
-    if len(actions) > len(recorded):
-        print(
-            f"{len(recorded)} actions take the time of {len(actions)}: some were faster than the "
-            "arm may go"
-        )
-    start = recording.state[frames.start, :6].tolist()
-    with driving(args, settings, recording, start=start) as (cell, servo, log):
-        for chunk in np.array_split(actions, math.ceil(len(actions) / 8)):
-            execute(chunk, cell, servo, log)
-            if servo.broken_off:
-                raise RobotError("camera or gripper were late: the rest would begin elsewhere")
-
-
 @dataclass
 class Log:
     """What was seen and done since the start; `driving` writes it in the end.
@@ -1641,6 +1534,37 @@ class Log:
             print(f"wrote {out}")
         except (UserError, RecordingError) as error:
             warn(str(error))
+
+
+def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
+    """Executes the actions (Ta, 7) of a chunk; logs them, and what is seen after each.
+
+    If the camera is late or fails, or the gripper is late, the rest of the chunk is left out, and
+    `servo.broken_off` is set; a gripper that fails raises RobotError.
+    """
+    period = 1 / servo.settings.policy_hz
+    servo.follow(chunk)
+    began = time.monotonic()
+    for step, action in enumerate(chunk, start=1):
+        servo.check()
+        log.actions.append(action)
+        log.commanded.append(servo.pose.tolist())
+        if servo.moves:
+            with cell.activity.during("moving the gripper"):
+                cell.gripper.move(action[6])
+        due = began + step * period
+        while time.monotonic() < due:
+            servo.check()
+            time.sleep(max(0.0, min(due - time.monotonic(), 0.02)))
+        servo.check()
+        log.frames.append(cell.observe_or_hold(servo))
+        servo.check()  # why the arm was stopped comes before "late"
+        late = time.monotonic() - due
+        if step < len(chunk) and late > period:
+            servo.hold()  # the arm moved on meanwhile: the gripper would act in the wrong place
+        if servo.broken_off:
+            log.breaks.append(len(log.actions))
+            return
 
 
 @contextmanager
@@ -1685,42 +1609,134 @@ def driving(
             print(servo.report())
 
 
-def execute(chunk: np.ndarray, cell: Cell, servo: Servo, log: Log) -> None:
-    """Executes the actions (Ta, 7) of a chunk; logs them, and what is seen after each.
+def load_policy(args: argparse.Namespace, settings: Settings) -> tuple[model.DAMIPolicy, dict]:
+    """The policy of --checkpoint, and what its file says beside the weights.
 
-    If the camera is late or fails, or the gripper is late, the rest of the chunk is left out, and
-    `servo.broken_off` is set; a gripper that fails raises RobotError.
+    Raises UserError for one that this robot's frames do not fit.
     """
-    period = 1 / servo.settings.policy_hz
-    servo.follow(chunk)
-    began = time.monotonic()
-    for step, action in enumerate(chunk, start=1):
-        servo.check()
-        log.actions.append(action)
-        log.commanded.append(servo.pose.tolist())
-        if servo.moves:
-            with cell.activity.during("moving the gripper"):
-                cell.gripper.move(action[6])
-        due = began + step * period
-        while time.monotonic() < due:
-            servo.check()
-            time.sleep(max(0.0, min(due - time.monotonic(), 0.02)))
-        servo.check()
-        log.frames.append(cell.observe_or_hold(servo))
-        servo.check()  # why the arm was stopped comes before "late"
-        late = time.monotonic() - due
-        if step < len(chunk) and late > period:
-            servo.hold()  # the arm moved on meanwhile: the gripper would act in the wrong place
-        if servo.broken_off:
-            log.breaks.append(len(log.actions))
-            return
+    checkpoint = Path(args.checkpoint)
+    if checkpoint.is_dir():
+        checkpoint = checkpoint / "adapted.pt"
+    policy, info = model.load(checkpoint, args.device, needs=("text_weights",))
+    config = policy.config
+    if (config.state_dim, config.action_dim) != (STATE_DIM, ACTION_DIM):
+        raise UserError(
+            f"{args.checkpoint} has states of {config.state_dim} and actions of "
+            f"{config.action_dim} numbers, this robot {STATE_DIM} and {ACTION_DIM}: use a policy "
+            "trained on its recordings"
+        )
+    if config.point_dim != 3:
+        raise UserError(
+            f"{args.checkpoint} reads points of {config.point_dim} numbers, this robot sees "
+            "positions alone: use a policy trained on its recordings"
+        )
+    if config.num_points > settings.num_points:
+        raise UserError(
+            f"{args.checkpoint} reads {config.num_points} points, num_points of the settings is "
+            f"{settings.num_points}: raise it"
+        )
+    return policy, info
+
+
+def warm_up(policy: model.DAMIPolicy, context: Any, settings: Settings, device: str) -> None:
+    """Draws two chunks before an arm waits for them: on a GPU the first may take seconds.
+
+    Raises UserError if the second takes longer than the arm may wait.
+    """
+    config = policy.config
+    points = torch.zeros(1, config.n_obs_steps, config.num_points, 3, device=device)
+    state = torch.zeros(1, config.n_obs_steps, config.state_dim, device=device)
+    for _ in range(2):
+        began = time.monotonic()
+        policy.sample_actions(points, state, context, torch.Generator().manual_seed(0)).cpu()
+        seconds = time.monotonic() - began
+    if seconds > settings.max_hold_s:
+        raise UserError(
+            f"the policy takes {seconds:.1f} s for a chunk, and max_hold_s is "
+            f"{settings.max_hold_s:g}: use a faster computer or a smaller policy"
+        )
+
+
+def run(args: argparse.Namespace, settings: Settings) -> None:
+    """Runs the policy: observes To frames, draws a chunk of Ta actions, executes it, and so on."""
+    common.pick_device(args.device)
+    policy, info = load_policy(args, settings)
+    config = policy.config
+    recording = data.load_demonstrations(args.data)
+    task = info.get("adapted_to", recording.task)
+    if task != recording.task:
+        raise UserError(f"{args.checkpoint} was adapted to {task}, {args.data} is of another task")
+    sampler = data.WindowSampler(recording, config, device=args.device)
+    text, _ = text_features([recording.instruction], args.clip_weights, info["text_weights"])
+    if not info.get("adaptation", {}).get("instruction", True):  # adapted without it
+        text = torch.zeros_like(text)
+    torch.set_num_threads(max(1, common.usable_cores() - 1))  # a core is left to the servo stream
+    generator = torch.Generator().manual_seed(args.seed)
+    demo = sampler.demonstration(sampler.sample_episode(generator))  # held for the whole run
+    with torch.no_grad():
+        context = policy.encode_demo(text.to(args.device), **demo)
+
+    warm_up(policy, context, settings, args.device)
+    with driving(args, settings, recording, start=settings.start_pose) as (cell, servo, log):
+        while log.seconds() < args.seconds:
+            with cell.activity.during("computing actions"):
+                newest = log.frames[-config.n_obs_steps :]
+                observed = [newest[0]] * (config.n_obs_steps - len(newest)) + newest  # To frames
+                points = torch.tensor(np.stack([frame.points for frame in observed]))[None]
+                points = points[:, :, : config.num_points].to(args.device)  # (1, To, N, 3)
+                state = torch.tensor(np.stack([frame.state for frame in observed]))[None]
+                state = state.to(args.device)  # (1, To, S)
+                try:
+                    actions = policy.sample_actions(points, state, context, generator)
+                except Exception as error:
+                    raise RobotError(f"the policy failed: {error!r}") from error
+                chunk = actions[0].cpu().numpy()  # (Ta, A)
+            if args.dry_run:
+                servo.begin_here()  # the policy sees that the arm has not moved
+            execute(chunk, cell, servo, log)
+
+
+def at_allowed_speed(actions: np.ndarray, settings: Settings) -> np.ndarray:
+    """Divides each action (T, 7) that is faster than targets may move into equal parts, (n, 7).
+
+    The way remains the same, and the gripper's place on it; only the time is longer.
+    """
+    parts = np.ceil(overspeed(actions, settings)).clip(1).astype(int)  # (T,)
+    divided = actions.copy()
+    divided[:, :6] /= parts[:, None]
+    return np.repeat(divided, parts, axis=0)
+
+
+def replay(args: argparse.Namespace, settings: Settings) -> None:
+    """Goes slowly to where a recorded episode began, and executes its actions."""
+    recording = data.load_demonstrations(args.data)
+    dims = recording.state.shape[1], recording.action.shape[1]
+    if dims != (STATE_DIM, ACTION_DIM):
+        raise UserError(f"{args.data} has {dims} dimensions of state and action: of another robot")
+    if not 0 <= args.episode < len(recording):
+        raise UserError(f"{args.data} has {len(recording)} episodes: no --episode {args.episode}")
+    frames = recording.episode(args.episode)
+    recorded = recording.action[frames]  # (T, A)
+    settings.check_steps(recorded)  # divided into parts, a jump would be none
+    actions = at_allowed_speed(recorded, settings)
+    if len(actions) > len(recorded):
+        print(
+            f"some actions are faster than the arm may go: {len(recorded)} are replayed as "
+            f"{len(actions)}"
+        )
+    start = recording.state[frames.start, :6].tolist()
+    with driving(args, settings, recording, start=start) as (cell, servo, log):
+        for chunk in np.array_split(actions, math.ceil(len(actions) / 8)):
+            execute(chunk, cell, servo, log)
+            if servo.broken_off:
+                raise RobotError("camera or gripper were late: the rest would begin elsewhere")
 
 
 # ---- Recording -----------------------------------------------------------------------------------
 
 
 class Keys:
-    """The keys pressed so far, one at a time, without waiting; where from: see `record`.
+    """Reads keys one at a time, without waiting, from a terminal or other standard input.
 
     In a terminal no Enter is needed.
     """
@@ -1752,7 +1768,7 @@ class Keys:
 
 
 def episode_actions(frames: list[Frame], grip: list[float], settings: Settings) -> np.ndarray:
-    """Frames (T) and the gripper's commands after each (T) -> actions (T, 7), to the next frame.
+    """The actions (T, 7) that lead from each frame to the next; `grip` is commanded after each.
 
     Raises RobotError for an episode that `run` could not execute.
     """
@@ -1791,7 +1807,7 @@ class Recorder:
         """Does what a key asks for."""
         if key == "g":
             self.closed = 1.0 - self.closed
-            if self.frames:  # the last one does not show it yet: it is done after that frame
+            if self.frames:  # the last one was taken before this key, so the command belongs to it
                 self.grip[-1] = self.closed
             servo.check()
             if servo.moves:
@@ -1990,8 +2006,8 @@ def check(args: argparse.Namespace, settings: Settings) -> None:
 def check_reference(pose: np.ndarray, settings: Settings) -> None:
     """Raises RobotError if the rotation vector of a pose (6,) may flip while the arm works.
 
-    Where both vectors of the tool's rotation are about as far from rotation_near_rad, each tremor
-    makes the other one the nearer.
+    Where both vectors of the tool's rotation are about equally far from rotation_near_rad, a small
+    motion switches from one to the other.
     """
     reference = np.array(settings.rotation_near_rad)
     if not pose[3:].any():  # no rotation: there is no other vector
