@@ -57,7 +57,7 @@ def control_job(
     return successes
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Measures what needs no network.")
     parser.add_argument("--suite", default="goals-reach", help="of hidden goals (goals-reach)")
     parser.add_argument("--data", default="data", help="folder of the demonstrations (data)")
@@ -66,7 +66,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, help="processes (one a core)")
     parser.add_argument("--out", help="folder of the report (runs/SUITE-controls)")
     parser.add_argument("--overwrite", action="store_true", help="replace the report in it")
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(argv)
 
     simulator = simulator_of(args.suite)
     _, tasks = simulator.tasks(args.suite)

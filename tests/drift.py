@@ -65,13 +65,17 @@ def forward_actions(
     return means
 
 
-def main(argv: list[str] | None = None) -> None:
+def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Whether a policy stands still at its goal.")
     parser.add_argument("checkpoint", help="a .pt file, or a folder of train.py")
     parser.add_argument("--task", nargs="+", default=["reach"], help="tasks of ML10 (reach)")
     parser.add_argument("--data", default="data", help="folder of its demonstrations")
     parser.add_argument("--threads", type=int, help="of PyTorch")
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = parse(argv)
     common.pick_device("cpu", args.threads)
 
     policy, info = evaluate.load_trained(evaluate.checkpoints_of(args.checkpoint)[-1])

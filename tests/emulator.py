@@ -622,7 +622,7 @@ def table_entry(value: int) -> int:
 CRC_TABLE = [table_entry(value) for value in range(256)]
 
 
-def main(argv: list[str] | None = None) -> None:
+def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Emulate a UR10e and its gripper on loopback.")
     parser.add_argument(
         "--hand", type=float, default=4.0, help="seconds a round of the hand that guides a free arm"
@@ -630,7 +630,11 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "--scene", metavar="FILE", default="scene.npz", help="recorded camera to write (scene.npz)"
     )
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = parse(argv)
     write_scene(args.scene)
     print(f"wrote {args.scene}, a recorded camera")
     with Emulator(30004, 30002, 29999, 54321, args.hand) as emulator:

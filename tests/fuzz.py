@@ -214,13 +214,17 @@ def fuzz_commands(folder: Path, data: Path, kills: int, seed: int = 0) -> list[s
     return ended
 
 
-def main(argv: list[str] | None = None) -> None:
+def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--files", type=int, default=2000, help="damaged files of each kind (2000)")
     parser.add_argument("--kills", type=int, default=200, help="killed commands (200)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--data", default="data", help="demonstrations of ml10 (data)")
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = parse(argv)
     with tempfile.TemporaryDirectory() as name:
         folder, recordings = Path(name), Path(args.data).resolve()
         policy = model.DAMIPolicy(model.PRESETS["tiny"])

@@ -216,12 +216,16 @@ def lengths(step: np.ndarray) -> tuple[float, float]:
     return math.hypot(*step[:3]), math.hypot(*step[3:])
 
 
-def main(argv: list[str] | None = None) -> None:
+def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scripts", type=int, default=50, help="how many of faults (50)")
     parser.add_argument("--poses", type=int, default=1000, help="how many (1000)")
     parser.add_argument("--seed", type=int, default=0, help="of the first (0)")
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = parse(argv)
     longest = 0.0
     for seed in range(args.seed, args.seed + args.poses):
         seconds, needed = fuzz_pose(seed)

@@ -151,12 +151,16 @@ WORLDS = {
 }
 
 
-def main() -> None:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Runs a command in another world.")
     parser.add_argument("world", choices=WORLDS)
     parser.add_argument("command", choices=("simulator.py", "train.py", "evaluate.py"))
     parser.add_argument("flags", nargs=argparse.REMAINDER, help="the command's")
-    args = parser.parse_args()
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(argv)
     WORLDS[args.world]()
 
     provenance_of_script = common.provenance

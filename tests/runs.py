@@ -355,7 +355,7 @@ def run_in_order(jobs: Sequence[Job], stopped: threading.Event) -> int:
     return failed
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Trains and measures what RESULTS.md shows.")
     parser.add_argument("--only", nargs="+", help="these variants (all)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of training")
@@ -365,7 +365,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--reports", nargs="+", help="these reports, such as base novel (all)")
     parser.add_argument("--at-once", type=int, default=2, help="runs at a time")
     parser.add_argument("--list", action="store_true", help="only say what is done")
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(argv)
 
     plan = plan_of(args.suite)
     variants = args.only or list(plan.variants)

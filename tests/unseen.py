@@ -22,13 +22,17 @@ from simulator import simulator_of
 SUITE = "ml10"
 
 
-def main(argv: list[str] | None = None) -> None:
+def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Action errors on goals that no training saw.")
     parser.add_argument("checkpoints", nargs="+", help=".pt files, or folders of train.py")
     parser.add_argument("--data", default="data", help="folder of the reference demonstrations")
     parser.add_argument("--unseen", default="data-unseen", help="folder of those to judge by")
     parser.add_argument("--threads", type=int, help="of PyTorch")
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = parse(argv)
     common.pick_device("cpu", args.threads)
     tasks, _ = simulator_of(SUITE).tasks(SUITE)
     seen = {task: load_demonstrations(Path(args.data) / f"{task}.npz") for task in tasks}
