@@ -441,14 +441,14 @@ def ablation_table(results: Results) -> str:
 def length_table(results: Results) -> str:
     """A row a checkpoint of the run whose checkpoints were all measured."""
     rows = [["outer steps", "minutes", "base tasks"]]
-    for run in results.values():
-        training = run.get("training", {})
-        for label, tasks in run.get("top", {}).get("checkpoints", {}).items():
-            step = int(re.search(r"\d+$", label)[0])
-            minutes = training["minutes"] * step / training["arguments"]["steps"]
-            episodes = "".join(tasks.values())
-            success = format_success(episodes.count("1"), len(episodes))
-            rows.append([str(step), f"{minutes:.0f}", success])
+    run = results["old-ml10-neither-seed0"]
+    training = run["training"]
+    for label, tasks in run["top"]["checkpoints"].items():
+        step = int(re.search(r"\d+$", label)[0])
+        minutes = training["minutes"] * step / training["arguments"]["steps"]
+        episodes = "".join(tasks.values())
+        success = format_success(episodes.count("1"), len(episodes))
+        rows.append([str(step), f"{minutes:.0f}", success])
     return format_table(rows)
 
 
@@ -752,11 +752,12 @@ TABLES: dict[str, Callable[[Results], str]] = {
 
 def fill(text: str, results: Results) -> str:
     """README or RESULTS.md with each table between its two comments as RESULTS.json has it."""
-    for name, make in TABLES.items():
-        pattern = rf"(<!-- results: {name} -->\n).*?(<!-- end -->)"
-        if found := re.search(pattern, text, flags=re.S):
-            text = text.replace(found[0], f"{found[1]}{make(results)}\n{found[2]}")
-    return text
+
+    def filled(match: re.Match) -> str:
+        opening, name, end = match.groups()
+        return f"{opening}{TABLES[name](results)}\n{end}"
+
+    return re.sub(r"(<!-- results: (.+?) -->\n).*?(<!-- end -->)", filled, text, flags=re.S)
 
 
 # ---- Charts --------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 
+import train
 from common import choose, command_line
 from tests.oracle import WORLDS
 from train import preset_settings
@@ -79,26 +80,36 @@ TUNING = {  # two fifths of the older recipe's steps, or as many windows; measur
 }
 VARIANTS = {**METHOD, **LIMITS, **TUNING}
 
-SEED = 1  # of the evaluation's goals, by which nothing was chosen since 2026-11-27
+SEED = 1  # of the evaluation's goals; since 2026-11-27 no choice was made on them
 EPISODES = 20  # of a task
 AGAIN = "-goals2"  # the same report on as many other goals
 
+
+@dataclass(frozen=True)
+class Report:
+    """A measurement of a run."""
+
+    command: str  # {run} is the run's folder. Its own --seed and --episodes win over the plan's
+    variants: Sequence[str]  # that it measures
+
+
 EVERY = tuple(METHOD)
-READS = ("dami", "no-inner-loop")  # a demonstration: may go without the instruction
+READS = ("dami", "no-inner-loop")  # a demonstration, and so can be measured without the instruction
 DECIDE = (*READS, "no-demonstration", "neither")
 SHOWN = (*READS, "neither", "scratch")
 LONGER = ("neither", "twice-as-long")
-REPORTS = {  # name -> command, and the variants that it measures; {run} is a run's folder
-    "base": ("evaluate.py --checkpoint {run}", EVERY),
-    "novel": ("finetune.py --task novel --checkpoint {run}", EVERY),
-    "told": ("evaluate.py --checkpoint {run} --swap demonstration instruction", READS),
-    "swap": ("evaluate.py --checkpoint {run} --without instruction --swap demonstration", READS),
-    "one-shot": ("evaluate.py --checkpoint {run} --split novel --without instruction", READS),
-    "top": ("evaluate.py --checkpoint {run} --top 5", ("neither",)),
-    "alone": ("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
-    f"base{AGAIN}": ("evaluate.py --checkpoint {run} --seed 2", DECIDE),
-    f"novel{AGAIN}": ("finetune.py --task novel --checkpoint {run} --seed 2", DECIDE),
-    "limits": ("evaluate.py --checkpoint {run} --seed 10", (*LONGER, *LIMITS, *TUNING)),
+WITHOUT = "evaluate.py --checkpoint {run} --without instruction"
+REPORTS = {
+    "base": Report("evaluate.py --checkpoint {run}", EVERY),
+    "novel": Report("finetune.py --task novel --checkpoint {run}", EVERY),
+    "told": Report("evaluate.py --checkpoint {run} --swap demonstration instruction", READS),
+    "swap": Report(f"{WITHOUT} --swap demonstration", READS),
+    "one-shot": Report(f"{WITHOUT} --split novel", READS),
+    "top": Report("evaluate.py --checkpoint {run} --top 5", ("neither",)),
+    "alone": Report("finetune.py --task novel --checkpoint {run} --no-instruction", READS),
+    f"base{AGAIN}": Report("evaluate.py --checkpoint {run} --seed 2", DECIDE),
+    f"novel{AGAIN}": Report("finetune.py --task novel --checkpoint {run} --seed 2", DECIDE),
+    "limits": Report("evaluate.py --checkpoint {run} --seed 10", (*LONGER, *LIMITS, *TUNING)),
 }
 CURVE = {  # along the adaptation, and with fewer demonstrations; flags of finetune.py
     "curve": "--curve 1 5 20 50",
@@ -108,11 +119,11 @@ CURVE = {  # along the adaptation, and with fewer demonstrations; flags of finet
     "5-shot": "--demonstrations 5",
 }
 for name, flags in CURVE.items():
-    REPORTS[name] = (f"finetune.py --task novel --checkpoint {{run}} {flags}", SHOWN)
+    REPORTS[name] = Report(f"finetune.py --task novel --checkpoint {{run}} {flags}", SHOWN)
 
 # Where goals are hidden. Some variants read a demonstration; those that read none have the same
-# batches, and some of them take inner steps. A step without inner step takes a fifth of the time of
-# one with, so that "neither-as-long" has as many minutes as "inner" on reach.
+# batches, and some of them take inner steps. "neither-as-long", which was not measured so far, is
+# multi-task training for about as many minutes as "inner" takes on reach.
 NO_DEMONSTRATION = "--demo-encoder none --tasks-per-step 12 --support 8 --query 4 --lr 1e-3"
 LEARNED_RATES = f"{NO_DEMONSTRATION} --vectorize 12 --learn-inner-lr --inner-lr 3e-2"
 INNER = f"{LEARNED_RATES} --pretrain-fraction 0.2"
@@ -148,31 +159,35 @@ READERS = ("demonstration", "demonstration-twice-the-rate")
 # python evaluate.py --suite goals-reach-validation --split novel --checkpoint
 # runs/goals-reach-neither-seed0 --episodes 3 --seed 2 --inner-steps 1 --inner-lr 0.03
 MULTI_TASK_RATES = {1: 0.03, 5: 0.01, 20: 0.3}
+INNER_STEPS = (1, 5, 20)  # that are measured
 
 
-def hidden_reports() -> dict[str, tuple[str, Sequence[str]]]:
+def hidden_reports() -> dict[str, Report]:
     """The same as REPORTS, where goals are hidden."""
     novel = "evaluate.py --split novel --checkpoint {run}"
     reports = {
-        "novel": (f"{novel} --swap demonstration --controls zeros", (*READERS, LONGEST, "both")),
+        "novel": Report(
+            f"{novel} --swap demonstration --controls zeros", (*READERS, LONGEST, "both")
+        ),
         # All goals share their starts, and five are few where some of them are hard.
-        "starts": (f"{novel} --episodes 20", (*READERS, LONGEST)),
-        "parts": (f"{novel} --controls last-frame no-actions shuffled", READERS),
-        "0-steps": (novel, (*ADAPTED, *MULTI_TASK, *NUMBERS_OF_GOALS, "marker")),
-        "1-steps-swap": (f"{novel} --inner-steps 1 --swap demonstration", ("inner",)),
-        "1-steps-of-1": (f"{novel} --inner-steps 1 --demonstrations 1", ("inner",)),
-        "1-steps-of-2": (f"{novel} --inner-steps 1 --demonstrations 2", ("inner",)),
+        "starts": Report(f"{novel} --episodes 20", (*READERS, LONGEST)),
+        "parts": Report(f"{novel} --controls last-frame no-actions shuffled", READERS),
+        "0-steps": Report(novel, (*ADAPTED, *MULTI_TASK, *NUMBERS_OF_GOALS, "marker")),
+        "1-steps-swap": Report(f"{novel} --inner-steps 1 --swap demonstration", ("inner",)),
+        "1-steps-of-1": Report(f"{novel} --inner-steps 1 --demonstrations 1", ("inner",)),
+        "1-steps-of-2": Report(f"{novel} --inner-steps 1 --demonstrations 2", ("inner",)),
     }
-    for steps, rate in MULTI_TASK_RATES.items():
+    for steps in INNER_STEPS:
         adapted = f"{novel} --inner-steps {steps}"
-        reports[f"{steps}-steps"] = (adapted, (*ADAPTED, "both"))
-        reports[f"{steps}-steps-best-rate"] = (f"{adapted} --inner-lr {rate}", MULTI_TASK)
+        at_best_rate = f"{adapted} --inner-lr {MULTI_TASK_RATES[steps]}"
+        reports[f"{steps}-steps"] = Report(adapted, (*ADAPTED, "both"))
+        reports[f"{steps}-steps-best-rate"] = Report(at_best_rate, MULTI_TASK)
     # As finetune.py adapts where nothing is said. On the goals of validation 200 such steps, after
     # multi-task training, ended 21 of 30 episodes at the goal; steps at three times the rates 20,
     # and with the normalizer of training 22 (--episodes 3 --seed 2, training seed 0).
     by_adamw = "finetune.py --task novel --checkpoint {run} --curve 1 5 20"
     arms = (*READERS, "both", "inner", "inner-first-order", *MULTI_TASK)
-    reports["adamw"] = (by_adamw, arms)  # the last, since it takes longest
+    reports["adamw"] = Report(by_adamw, arms)  # the last, since it takes longest
     return reports
 
 
@@ -192,15 +207,15 @@ TURNED_MULTI_TASK_RATES = {1: 0.01, 5: 0.03}
 
 
 def angles_apart(skill: str) -> list[str]:
-    """The tasks of the eight new angles, in an order in which the next one is 135 degrees further.
+    """The tasks of the eight new angles, each 135 degrees after the one before it.
 
-    That holds for the last and the first, too.
+    That holds for the first, which comes after the last, too.
     """
     angles = ANGLES["novel"]
     return [turned_task(skill, angles[3 * i % len(angles)]) for i in range(len(angles))]
 
 
-def unnamed_reports(suite: str) -> dict[str, tuple[str, Sequence[str]]]:
+def unnamed_reports(suite: str) -> dict[str, Report]:
     """The same as REPORTS, for "pairs" and for "convention-SKILL".
 
     `--swap demonstration` shows each task that is named the demonstration of the next one, and the
@@ -218,14 +233,14 @@ def unnamed_reports(suite: str) -> dict[str, tuple[str, Sequence[str]]]:
     for group, tasks in groups.items():
         named = f"evaluate.py --task {' '.join(tasks)} --checkpoint {{run}}"
         swapped = f"{named} --swap demonstration --controls zeros no-actions"
-        reports[group] = (swapped, ("demonstration",))
+        reports[group] = Report(swapped, ("demonstration",))
     for steps in (0, 1, 5):
-        reports[f"{steps}-steps"] = (f"{evaluation} --inner-steps {steps}", ("inner",))
-    reports["multi-task"] = (evaluation, ("neither",))
+        reports[f"{steps}-steps"] = Report(f"{evaluation} --inner-steps {steps}", ("inner",))
+    reports["multi-task"] = Report(evaluation, ("neither",))
     if suite == "convention-reach":
         for steps, rate in TURNED_MULTI_TASK_RATES.items():
             adapted = f"{evaluation} --inner-steps {steps} --inner-lr {rate}"
-            reports[f"{steps}-steps-best-rate"] = (adapted, ("neither",))
+            reports[f"{steps}-steps-best-rate"] = Report(adapted, ("neither",))
     return reports
 
 
@@ -239,7 +254,7 @@ class Plan:
     """What is trained on a suite, and how it is measured."""
 
     variants: dict[str, str]  # name -> flags of train.py
-    reports: dict[str, tuple[str, Sequence[str]]]  # see REPORTS
+    reports: dict[str, Report]
     episodes: int  # of a task
 
 
@@ -270,11 +285,13 @@ class Job:
 
     def is_done(self) -> bool:
         """Whether its result exists, and is not of an earlier training."""
-        if self.measures is None or not self.result.exists():
-            return self.result.exists()
-        return (
-            self.measures.exists() and self.measures.stat().st_mtime <= self.result.stat().st_mtime
-        )
+        if not self.result.exists():
+            return False
+        if self.measures is None:  # a training
+            return True
+        if not self.measures.exists():  # a report of a training that is gone
+            return False
+        return self.measures.stat().st_mtime <= self.result.stat().st_mtime
 
     def run(self) -> int:
         """Runs it in a process; returns the exit code."""
@@ -292,8 +309,7 @@ class Job:
 
 def steps_of(suite: str, flags: str) -> int:
     """How many outer steps a training with these flags takes."""
-    given = re.findall(r"--steps (\d+)", flags)
-    return int(given[-1]) if given else preset_settings("small", suite).steps
+    return train.parse(flags.split()).steps or preset_settings("small", suite).steps
 
 
 def jobs_of_run(
@@ -301,7 +317,7 @@ def jobs_of_run(
 ) -> list[Job]:
     """The jobs of a run in their order: its training, then the reports that measure it.
 
-    `flags` are those of the training, beside the variant's; of the reports `only` some are made, or
+    `flags` are those of the training, beside the variant's. `only` names the reports to make; None:
     all of the plan.
     """
     plan = plan_of(suite)
@@ -323,16 +339,16 @@ def jobs_of_run(
     )
     checkpoint = run / f"ema-{steps:05d}.pt"
     jobs = [Job(training, result=checkpoint, log=log)]
-    for name, (command, variants) in plan.reports.items():
-        if variant not in variants or (only and name not in only):
+    for name, report in plan.reports.items():
+        if variant not in report.variants or (only and name not in only):
             continue
         out = Path(f"{run}-{name}")
-        script, report_flags = command.format(run=run).split(" ", 1)
-        report = (
+        script, report_flags = report.command.format(run=run).split(" ", 1)
+        command = (
             f"{world}{script} --episodes {episodes} --seed {SEED} {report_flags}{data} "
             f"--workers 1 --threads 1 --out {out} --overwrite"
         )
-        jobs.append(Job(report, result=out / "success.json", log=log, measures=checkpoint))
+        jobs.append(Job(command, result=out / "success.json", log=log, measures=checkpoint))
     return jobs
 
 

@@ -1,8 +1,10 @@
 """What README and RESULTS.md claim is what RESULTS.json holds."""
 
+import importlib
 import json
 import os
 import re
+import threading
 from dataclasses import asdict, fields, replace
 
 import numpy as np
@@ -12,7 +14,7 @@ from common import UserError
 from hidden_goals import SKILLS, names_of
 from model import PRESETS, PolicyConfig
 from report import mean_interval, wilson_interval
-from simulator import SIMULATORS
+from tests.oracle import WORLDS
 from tests.results import (
     HIDDEN_ROWS,
     HIDDEN_SUMMARY,
@@ -32,19 +34,19 @@ from tests.results import (
 )
 from tests.runs import (
     AGAIN,
-    EPISODES,
-    HIDDEN_METHOD,
     HIDDEN_REPORTS,
+    HIDDEN_SUITES,
     LIMITS,
     LONGER,
-    REPORTS,
     SEED,
     TUNING,
-    UNNAMED_METHOD,
     UNNAMED_REPORTS,
     UNNAMED_SUITES,
     VARIANTS,
     Job,
+    jobs_of_run,
+    plan_of,
+    run_in_order,
 )
 from train import SETTINGS, Settings, parse, preset_settings
 from unnamed_tasks import SCENES
@@ -278,49 +280,76 @@ def test_a_report_has_the_columns_that_tables_show_of_it():
     assert found > 50
 
 
-def test_runs_on_tasks_without_a_name_are_those_of_the_queue():
-    for name, run in UNNAMED.items():
-        suite, variant = re.fullmatch(rf"({'|'.join(UNNAMED_SUITES)})-(.+)-seed\d", name).groups()
-        check_training(name, suite, UNNAMED_METHOD[variant])
-        for part in run:
-            if part == "training":
-                continue
-            assert variant in UNNAMED_REPORTS[suite][part][1]
-            assert run[part]["provenance"]["seed"] == SEED
-            for tasks in run[part]["successes"].values():
-                assert {len(digits) for digits in tasks.values()} == {20}
+def test_runs_of_today_are_those_of_the_queue_and_say_how_they_were_measured():
+    suites = "|".join(("ml10", *HIDDEN_SUITES, *UNNAMED_SUITES))
+    for name, run in {**ML10, **HIDDEN, **UNNAMED}.items():
+        if name.endswith("-controls"):
+            continue
+        suite, variant = re.fullmatch(rf"({suites})-(.+)-seed\d", name).groups()
+        plan = plan_of(suite)
+        check_training(name, suite, plan.variants[variant])
+        world = f"-m tests.oracle {variant} " if variant in WORLDS else "python "
+        assert world in run["training"]["command"], name
+        for part in run.keys() - {"training"}:
+            report, provenance = plan.reports[part], run[part]["provenance"]
+            assert variant in report.variants, (name, part)
+            assert {"command", "hardware", "date"} <= set(provenance)
+            assert world in provenance["command"], (name, part)
+            flags = f"--seed {SEED} --episodes {plan.episodes} {report.command}"
+            seed = int(re.findall(r"--seed (\d+)", flags)[-1])  # the last one wins
+            episodes = int(re.findall(r"--episodes (\d+)", flags)[-1])
+            assert provenance["seed"] == seed, (name, part)
+            tasks_of_columns = run[part]["successes"].values()
+            for tasks in tasks_of_columns:
+                assert {len(digits) for digits in tasks.values()} == {episodes}, (name, part)
+                if suite in HIDDEN_SUITES:
+                    skill = suite.removeprefix("goals-")
+                    assert list(tasks) == names_of(skill, "novel"), (name, part)
+                elif suite == "ml10":
+                    assert list(tasks) == TASKS["ml10"][part.removesuffix(AGAIN)], (name, part)
+    for name in (f"{suite}-controls" for suite in HIDDEN_SUITES):  # without a network
+        [report] = HELD[name].values()
+        assert report["provenance"]["seed"] == SEED  # of the starts: rows are compared
 
 
-def test_runs_on_ml10_are_those_of_the_queue():
-    for name, run in ML10.items():
-        variant = re.fullmatch(r"ml10-(.+)-seed\d", name)[1]
-        check_training(name, "ml10", VARIANTS[variant])
-        assert run["training"]["arguments"]["steps"] == preset_settings("small", "ml10").steps
-        for part in run:
-            if part == "training":
-                continue
-            assert variant in REPORTS[part][1]
-            assert run[part]["provenance"]["seed"] == (2 if part.endswith(AGAIN) else SEED)
-            for tasks in run[part]["successes"].values():
-                assert list(tasks) == TASKS["ml10"][part.removesuffix(AGAIN)]
-                assert {len(digits) for digits in tasks.values()} == {EPISODES}
+def test_every_result_is_of_one_of_these_kinds():
+    assert set(HELD) == {*OLD, *ML10, *HIDDEN, *UNNAMED, SHIPPED, "rl-ml10-seed0"}
 
 
-def test_runs_on_hidden_goals_are_those_of_the_queue_and_say_how_they_were_measured():
-    for name, run in HIDDEN.items():
-        named = re.fullmatch(r"(goals-(reach|push|pick-place))-(.+?)(?:-seed\d)?", name)
-        suite, skill, variant = named.groups()
-        assert suite in SIMULATORS
-        reports = {part: run[part] for part in run if part != "training"}
-        if variant == "controls":
-            assert list(reports) == ["novel"]
-        else:
-            check_training(name, suite, HIDDEN_METHOD[variant])
-            assert all(variant in HIDDEN_REPORTS[report][1] for report in reports)
-        for part, report in reports.items():
-            assert {"command", "hardware", "date"} <= set(report["provenance"])
-            assert report["provenance"]["seed"] == SEED  # of the starts: rows are compared
-            episodes = 20 if part == "starts" else 5
-            for tasks in report["successes"].values():
-                assert list(tasks) == names_of(skill, "novel")
-                assert {len(digits) for digits in tasks.values()} == {episodes}
+@pytest.mark.parametrize("suite", ["ml10", "ml45", *HIDDEN_SUITES, *UNNAMED_SUITES])
+def test_every_command_of_the_queue_parses(suite):
+    variants = plan_of(suite).variants
+    for variant in variants:
+        for job in jobs_of_run(variant, 0, suite=suite, flags="", episodes=5, only=None):
+            words = job.command.split()
+            script, *flags = words[3:] if words[0] == "-m" else words  # behind tests.oracle WORLD
+            importlib.import_module(script.removesuffix(".py")).parse(flags)
+
+
+def test_the_rows_of_tables_are_of_reports_that_are_made():
+    hidden = [(variant, column) for _, variant, column in HIDDEN_ROWS]
+    for variant, column in [*hidden, *NUMBERS_OF_GOALS.values()]:
+        if variant != "controls":
+            assert variant in HIDDEN_REPORTS[column.report].variants, (variant, column)
+    for _, variant, report, _ in UNNAMED_ROWS:
+        if report is not None:
+            assert variant in UNNAMED_REPORTS["convention-reach"][report].variants
+
+
+def test_the_jobs_of_a_run_end_where_its_training_fails(tmp_path, monkeypatch):
+    done = []
+
+    def run(job):
+        done.append(job.command)
+        return int(job.command == "train fails")
+
+    monkeypatch.setattr(Job, "run", run)
+    stopped = threading.Event()
+    report = Job("report", tmp_path / "a", tmp_path / "log", measures=tmp_path / "b")
+    training = Job("train fails", tmp_path / "c", tmp_path / "log")
+    assert run_in_order([training, report], stopped) == 1 and done == ["train fails"]
+    training = replace(training, command="train")
+    assert run_in_order([training, report], stopped) == 0
+    assert done[1:] == ["train", "report"]
+    stopped.set()
+    assert run_in_order([training, report], stopped) == 0 and len(done) == 3

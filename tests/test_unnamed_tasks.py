@@ -334,10 +334,10 @@ def test_the_queue_shows_each_task_the_demonstration_of_one_that_contradicts_it(
     for flags in plan.variants.values():
         train.parse(flags.split())  # exits if one is unknown
     named = []
-    for command, variants in plan.reports.values():
-        assert set(variants) <= set(plan.variants)
-        if "--swap demonstration" in command:
-            tasks = re.search(r"--task (.*?) --", command)[1].split()
+    for report in plan.reports.values():
+        assert set(report.variants) <= set(plan.variants)
+        if "--swap demonstration" in report.command:
+            tasks = re.search(r"--task (.*?) --", report.command)[1].split()
             # task -> the one whose demonstration it is shown
             shown = evaluate.of_next_task(dict(zip(tasks, tasks)))
             named += tasks
