@@ -128,10 +128,14 @@ def not_averaged() -> None:
 
 
 def frozen() -> None:
-    """Training without an inner step ends as if it were all; then only inner rates are learned."""
+    """The steps without an inner step follow a whole schedule of their own, down to a rate of 0.
+
+    The later ones train the rates of the inner step alone.
+    """
     schedule = train.learning_rate
 
     def learning_rate(step: int, settings: train.Settings, peak: float) -> float:
+        assert settings.lr != settings.rate_lr, "--lr and --rate-lr must differ to be told apart"
         if peak == settings.rate_lr:
             return peak
         if step >= settings.pretrain_steps:

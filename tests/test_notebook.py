@@ -3,6 +3,7 @@
 import ast
 import base64
 import builtins
+import hashlib
 import re
 from pathlib import Path
 
@@ -46,6 +47,36 @@ def names(tree):
     return bound, read
 
 
+class Bound(ast.NodeVisitor):
+    """Collects the names that later cells can read: not those of functions and comprehensions."""
+
+    def __init__(self):
+        self.names = set()
+
+    def visit_Name(self, node):
+        if isinstance(node.ctx, ast.Store):
+            self.names.add(node.id)
+
+    def visit_FunctionDef(self, node):
+        self.names.add(node.name)
+
+    visit_ClassDef = visit_FunctionDef
+
+    def visit_alias(self, node):
+        self.names.add(node.asname or node.name)
+
+    def skip(self, node):
+        pass
+
+    visit_Lambda = visit_ListComp = visit_SetComp = visit_DictComp = visit_GeneratorExp = skip
+
+
+def bound_for_later_cells(tree):
+    visitor = Bound()
+    visitor.visit(tree)
+    return visitor.names
+
+
 def printed(notebook):
     """All text that the cells wrote to stdout."""
     outputs = (output for cell in notebook.cells for output in cell.get("outputs", []))
@@ -62,7 +93,9 @@ def pictures(notebook):
 def test_the_tutorials_outputs_are_committed_as_it_ran():
     notebook = nbformat.read(TUTORIAL, as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert len(notebook.cells) <= 52 and TUTORIAL.stat().st_size < 7e6
+    assert TUTORIAL.stat().st_size < 7e6
+    sources = "\n".join(cell.source for cell in code)
+    assert notebook.metadata["executed_sha256"] == hashlib.sha256(sources.encode()).hexdigest()
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
     assert QUICK not in printed(notebook)  # in full length, so all assertions were made
     widths = pictures(notebook)
@@ -79,13 +112,13 @@ def test_the_tutorials_outputs_are_committed_as_it_ran():
 
 def test_a_section_of_the_tutorial_needs_the_set_up_and_nothing_else():
     setup, *others = sections().values()
-    known = set(dir(builtins)).union(*(names(tree)[0] for tree in setup))
+    known = set(dir(builtins)).union(*(bound_for_later_cells(tree) for tree in setup))
     for cells in others:
         here = set(known)
         for tree in cells:
             bound, read = names(tree)
-            here |= bound
-            assert read <= here, read - here
+            assert read <= here | bound, read - here - bound
+            here |= bound_for_later_cells(tree)
 
 
 def test_a_task_is_named_in_one_cell_of_the_tutorial():
@@ -93,18 +126,6 @@ def test_a_task_is_named_in_one_cell_of_the_tutorial():
     for tree in [*setup[1:], *(tree for cells in others for tree in cells)]:
         strings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
         assert not strings & set(INSTRUCTIONS)
-
-
-def test_the_tutorial_asserts_what_it_claims():
-    checked = " ".join(
-        ast.unparse(node)
-        for cells in sections().values()
-        for tree in cells
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Assert)
-    )
-    for claim in ("losses['MAML', 1]", "off['second']", "by_hand", "own demonstration alone"):
-        assert claim in checked, claim
 
 
 def test_the_tutorial_runs(monkeypatch):
