@@ -24,7 +24,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 import model
-from common import UserError, command_line, format_table, read_json_lines
+from common import UserError, command_line, count, format_table, read_json_lines
 from data import write_text
 from evaluate import SHIPPED_CHECKPOINT, TRAINED, checkpoints_of, load_trained
 from model import CheckpointError
@@ -80,9 +80,9 @@ VARIANTS = {  # a run's name without its seed -> what it is
     "old-ml45-no-inner-loop": "ML45, without the inner loop",
 }
 SWAPPED = {  # a run -> its panel in the swap chart
-    "before-seed0": "instruction never left out",
-    "old-ml10-dami-seed0": "DAMI",
-    "old-ml10-no-inner-loop-cpu-seed0": "no inner loop, on the CPU",
+    "before-seed0": "DAMI, always told its instruction",
+    "old-ml10-dami-seed0": "DAMI, seed 0",
+    "old-ml10-no-inner-loop-cpu-seed0": "no inner loop, on the CPU, seed 0",
 }
 POLICIES = {  # of baselines.py -> what the paper calls it
     policy: name for policy, name in PAPER_NAMES.items() if policy not in ("dami", "rl")
@@ -770,8 +770,8 @@ def plot_swap(results: Results, path: Path) -> None:
 
     policies = {title: columns for title, columns in swaps(results).items() if columns}
     labels = list(max(policies.values(), key=len))
-    figure = Figure(figsize=(8.5, 3.4), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(policies), sharey=True))
+    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    panels = figure.subplots(1, len(policies), sharey=True)
     own_color, other_color = "C0", "C3"
     for axes, (title, columns) in zip(panels, policies.items()):
         for place, label in enumerate(labels):
@@ -785,13 +785,16 @@ def plot_swap(results: Results, path: Path) -> None:
             axes.barh(place, 100 * rate, xerr=error, color=color, capsize=2)
         axes.set_yticks(range(len(labels)), labels, fontsize=8)
         axes.set(xlabel="success, %", xlim=(0, 100), ylim=(len(labels) - 0.4, -0.6))
-        axes.set_title(title, fontsize=9)
+        axes.set_title(title, fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
     legend = [
-        Patch(color=own_color, label="all that it sees is of its own task"),
-        Patch(color=other_color, label="an input is of another task; a long bar: it is ignored"),
+        Patch(color=own_color, label="all inputs are of the task that is measured"),
+        Patch(
+            color=other_color, label="one is of another task: a long bar says that it is ignored"
+        ),
     ]
-    figure.legend(handles=legend, ncols=2, loc="outside upper center", frameon=False, fontsize=8)
+    figure.legend(handles=legend, ncols=2, loc="outside lower center", frameon=False, fontsize=8)
+    figure.suptitle("ML10's base tasks, three single trainings of an older recipe", fontsize=10)
     save_png(figure, path, dpi=120)
 
 
@@ -845,9 +848,11 @@ def plot_adaptation(results: Results, path: Path) -> None:
         axes.minorticks_off()
         axes.set(xlabel=label, ylim=(0, 100))
         axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].set_ylabel("success on novel tasks, %")
+    figure.axes[0].set_ylabel("success at any step, %")
+    title = "ML10's novel tasks, an older recipe: one training each, 100 episodes a point"
+    figure.suptitle(title, fontsize=10)
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, ncols=2, loc="outside upper center", fontsize=8)
+    figure.legend(handles, labels, frameon=False, ncols=2, loc="outside lower center", fontsize=8)
     save_png(figure, path, dpi=120)
 
 
@@ -855,7 +860,7 @@ ARMS = {  # of those without a demonstration encoder -> its line in the figure
     "inner": "second-order MAML",
     "inner-first-order": "first-order MAML",
     "frozen": "multi-task, then learned rates",
-    "neither": "multi-task",
+    "neither": "multi-task, inner steps at the best of five rates",
 }
 
 
@@ -868,8 +873,11 @@ def columns_of_steps(arm: str) -> dict[str, dict[int, Column]]:
     inner_steps = {n: Column(f"{n}-steps{best_rate}") for n in (1, 5, 20)}
     adamw = {n: Column("adamw", f"{n} steps") for n in (1, 5, 20)}
     return {
-        "inner steps, on eight windows": {0: Column("0-steps"), **inner_steps},
-        "steps of AdamW, on 64 windows each": {
+        "inner steps (gradient descent), all on the same eight windows": {
+            0: Column("0-steps"),
+            **inner_steps,
+        },
+        "steps of AdamW, each on 64 windows": {
             0: Column("adamw", "before"),
             **adamw,
             200: Column("adamw", "after"),
@@ -908,7 +916,9 @@ def plot_steps(results: Results, skill: str, path: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel(f"success at the end, {skill}, %")
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, ncols=3, loc="outside upper center", frameon=False, fontsize=8)
+    figure.legend(handles, labels, ncols=3, loc="outside lower center", frameon=False, fontsize=8)
+    title = f"{skill}, goals never seen: each dot is one training, lines are their means"
+    figure.suptitle(title, fontsize=10)
     save_png(figure, path, dpi=120)
 
 
@@ -916,7 +926,7 @@ def plot_by_task(results: Results, path: Path) -> None:
     """Writes a chart of success by task, of all seeds together, beside the paper's."""
     columns: dict[str, Successes] = {}
     for variant, label in variants_of(results, "ml10").items():
-        columns[label] = {
+        columns[f"{label}, {count(len(runs_of(results, variant)), 'training')}"] = {
             task: together(results, variant, column, [task])
             for split, column in MEASURED_BY.items()
             for task in TASKS["ml10"][split]
@@ -1022,8 +1032,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     plot_swap(results, ROOT / "assets" / "swap.png")
     plot_by_task(results, ROOT / "assets" / "success.png")
     plot_steps(results, "reach", ROOT / "assets" / "inner-steps.png")
-    if any("curve" in run for run in results.values()):
-        plot_adaptation(results, ROOT / "assets" / "adaptation.png")
+    plot_adaptation(results, ROOT / "assets" / "adaptation.png")
 
 
 if __name__ == "__main__":
