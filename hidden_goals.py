@@ -6,20 +6,19 @@
 In Meta-World's suites the scene tells the task: a policy that ignores its demonstration can still
 succeed. Here a task is one goal of one skill, as in Meta-World's own ML1, and the goal's marker is
 taken out of the cloud. All goals of a skill have the same instruction, and an episode begins at a
-place that says nothing of the goal. What is left to tell the goal is the demonstration, and the
-windows of an inner step.
+place that says nothing of the goal. Only the demonstration and the windows of an inner step tell
+it.
 
 Three things differ from ML1. Goals lie on a wide area, so that the way to one does not pass
 another. The hand begins at another place in every episode: from one place for all, a replay of the
 demonstration's actions would do. And the object begins in a region so small that Meta-World's rule,
-by which object and goal are at least 15 cm apart, never rejects a start: a rejected start would
-tell of the goal.
+by which object and goal are at least 15 cm apart, never rejects a start: otherwise the start would
+depend on the goal.
 
 All lengths are metres, in the world frame.
 """
 
 import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -33,8 +32,8 @@ from metaworld_env import INSTRUCTIONS, RECIPE, RENDER_PIXELS, MetaWorldPointClo
 # ---- Goals and starts ----------------------------------------------------------------------------
 
 SKILLS = ("reach", "push", "pick-place")
-# How many goals of each kind a skill has: to train on, to choose by, and to measure on. Tasks are
-# called after them: reach-goal-07, reach-validation-07, reach-novel-07.
+# How many goals of each kind a skill has: for training, for choosing settings, and for results.
+# Tasks are called after them: reach-goal-07, reach-validation-07, reach-novel-07.
 NUM_GOALS = {"goal": 320, "validation": 10, "novel": 20}
 
 # Where goals lie: in this box, and so far from the middle of where objects begin, horizontally.
@@ -176,13 +175,6 @@ class HiddenGoalEnv(MetaWorldPointCloudEnv):
 # ---- For simulator.py ----------------------------------------------------------------------------
 
 
-def all_tasks() -> Iterator[str]:
-    """The tasks of all skills, in the order that decides the seeds of demonstrations."""
-    for skill in SKILLS:
-        for kind in NUM_GOALS:
-            yield from names_of(skill, kind)
-
-
 @dataclass(frozen=True)
 class HiddenGoals:
     """Skills with hidden goals as a `simulator.Simulator`."""
@@ -190,7 +182,10 @@ class HiddenGoals:
     episode_steps: int = 100  # experts need 30 to 75
     name: ClassVar[str] = "meta-world, hidden goals"
     instructions: ClassVar[dict[str, str]] = {
-        task: INSTRUCTIONS[split_name(task)[0]] for task in all_tasks()
+        task: INSTRUCTIONS[skill]
+        for skill in SKILLS
+        for kind in NUM_GOALS
+        for task in names_of(skill, kind)
     }
     recipe: ClassVar[dict] = {**SMALL_RECIPE, "simulator": name, "grip": "full force in push"}
     packages: ClassVar[tuple[str, ...]] = ("metaworld", "mujoco")
@@ -199,8 +194,8 @@ class HiddenGoals:
     def tasks(self, suite: str) -> tuple[list[str], list[str]]:
         """Returns the (base, novel) goals of "goals-SKILL".
 
-        In "goals-SKILL-validation" other goals stand in the place of the novel ones. Whatever is
-        chosen is chosen on those.
+        In "goals-SKILL-validation" other goals stand in the place of the novel ones. Settings are
+        chosen on those.
         """
         name = suite.removeprefix("goals-")
         skill = name.removesuffix("-validation")

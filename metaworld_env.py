@@ -123,8 +123,9 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
     """A Meta-World task as a point cloud; also `gymnasium.make("DAMI/MetaWorld-v0", task="reach")`.
 
     Observation: "point_cloud" (N, 3) float32 and "agent_pos" (9,) float32, the positions of the end
-    effector, the right and the left finger; world frame, metres. A cloud is of farthest points of
-    objects, goal marker and gripper; the arm only hides, unless nothing else is seen.
+    effector, the right and the left finger; world frame, metres. A cloud is a farthest point
+    sample of objects, goal marker and gripper. The arm hides what is behind it and gives no points,
+    unless nothing else can be seen.
 
     Action (4,) in [-1, 1]: dx, dy, dz in centimetres, gripper (1 closes).
 
@@ -169,7 +170,8 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         sawyer_env.seeded_rand_vec = True  # ... from a generator of its own, not NumPy's global
         sawyer_env._partially_observable = False  # the expert needs the goal
         sawyer_env.max_path_length = episode_steps  # Meta-World's own is 500
-        del sawyer_env.sawyer_observation_space  # cached with the goal hidden: clips it to zero
+        # It was cached while the goal was hidden, and would clip the goal to 0.
+        del sawyer_env.sawyer_observation_space
         sawyer_env.touching_object = partial(touching_object, sawyer_env)
         self.sawyer_env = sawyer_env
         self.expert = ENV_POLICY_MAP[f"{task}-v3"]()
@@ -315,7 +317,7 @@ class MetaWorldPointCloudEnv(gymnasium.Env):
         Reach is a success where the fingertips are within 5 cm of the goal, and pick-place where
         the puck between them is within 7 cm. But Meta-World's experts bring the hand there, which
         is 4.5 cm above the fingertips: what is left is half a centimetre in reach, and 2.5 cm in
-        pick-place. They are therefore told a goal that is as much higher.
+        pick-place. So the goal that they are told is raised by as much.
         """
         if self.resting_place is not None:
             displacement = REST_GAIN * (self.resting_place - self.hand())
@@ -360,7 +362,7 @@ def make_sawyer_env(task: str) -> Any:
 def touching_object(sawyer_env: Any, object_geom_id: int) -> bool:
     """Whether both fingers press on the geom of this number.
 
-    It says what Meta-World's method of this name says, and takes its place: that one goes through
+    It replaces Meta-World's method of this name, and returns the same. The original goes through
     all contacts in Python, which takes half the time of a step of pick-place.
     """
     data = sawyer_env.data

@@ -215,7 +215,8 @@ def write_report(
         provenance: how the results were measured, name -> value; "title" is the chart's.
         checkpoints: label -> results of all checkpoints, also of those that `outcomes` leaves out.
             They are written into success.json, and stand in no table.
-        pooled: table and chart put the episodes of all tasks together: a row for each label.
+        pooled: the episodes of all tasks are put together; table and chart then have one row for
+            each label.
     """
     any_step = {label: o.any_step for label, o in outcomes.items()}
     at_end = {label: o.at_end for label, o in outcomes.items() if o.at_end is not None}
@@ -381,8 +382,8 @@ def plot_demonstration(
 ) -> None:
     """Writes a picture of one episode: its clouds along time, and its actions.
 
-    Points have their own color where three features follow their position, none below 0, and else
-    that of their height. Positions in the state (hand and fingers) are red dots. The boxes
+    Points with three features, none below 0, are drawn in that color; all others are colored by
+    their height. Positions in the state (hand and fingers) are red dots. The boxes
     `workspace` and `tcp_box` are drawn where the recording's meta has them.
 
     Args:

@@ -50,11 +50,12 @@ class Environment(Protocol):
         "point_cloud" (N, 3) float32, or (N, point_dim) where points have features such as colours;
         in the order of farthest point sampling, so that its first k points are a good sample, too.
         "agent_pos" (S,) float32. World frame, metres. Raises OutOfSightError where nothing is seen.
-        A rollout in which this happens after a step is over then, and its end is no success.
+        If that happens after a step, the rollout ends there, and its last step counts as no
+        success; right after `begin` something must be seen.
         """
 
     def advance(self, action: np.ndarray) -> tuple[float, bool, dict]:
-        """Takes one step with an action (A,) float32.
+        """Takes one step with an action (A,) float32, which it clips to what is allowed.
 
         Returns (reward, truncated, {"success": bool}). An episode succeeds if any of its steps
         does, and it is over when it is truncated: `advance` is not called again before `begin`.
@@ -81,7 +82,9 @@ class Simulator(Protocol):
     """
 
     name: str
-    instructions: dict[str, str]  # task -> what the robot is told; its order decides the seeds
+    # Task -> what the robot is told. A task's place in it, and how many tasks there are, decide the
+    # seeds of its demonstrations.
+    instructions: dict[str, str]
     # How recordings are made: "simulator" (the name), "num_points" and more. With "success": "at
     # the end" an expert's episode is kept only if its last step is a success, too. With "made_by"
     # there is no expert: it then says how a user makes the recordings.
@@ -182,8 +185,8 @@ def environments_of(
 ) -> list[Environment]:
     """Returns `number` environments of a task, whose clouds have `num_points` points.
 
-    Environments of the previous call are used again, for another task if they can change to it. So
-    whoever asked for those must have finished with them.
+    Environments of the previous call are used again, for another task if they can change to it: the
+    caller must have finished with those.
     """
     environments = kept.environments
     kept.environments = []  # should anything fail below, none is kept
@@ -205,7 +208,7 @@ def environments_of(
 
 # ---- Seeds of episodes ---------------------------------------------------------------------------
 
-RUN_SEEDS = 1_000  # what a user calls --seed is below this
+RUN_SEEDS = 1_000  # a --seed is below this
 EPISODE_SEEDS = 100_000  # episodes that each --seed has
 
 
@@ -249,7 +252,7 @@ def draw_base_tasks(base_tasks: Sequence[str], n: int | None, seed: int) -> list
 def demonstration_seed(simulator: Simulator, task: str, seed: int, attempt: int) -> int:
     """Returns the episode seed of one attempt at a demonstration, below 10**8.
 
-    No two tasks share a seed. With equal seeds, tasks that draw their goals alike would have the
+    No two tasks share a seed: tasks that draw their goals by the same rule would otherwise have the
     same ones. Raises ValueError for an attempt that would have a seed of the next task.
     """
     seeds = seeds_of_a_task(simulator)
@@ -285,7 +288,7 @@ def check_recipe(demonstrations: Demonstrations, path: str | Path, recipe: dict[
     changed = [
         name
         for name, value in recipe.items()
-        if demonstrations.meta.get(name) != value and name != "made_by"  # advice, and no property
+        if demonstrations.meta.get(name) != value and name != "made_by"  # which is advice
     ]
     if changed:
         raise UserError(
@@ -484,12 +487,12 @@ def record_episode(
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Collects expert demonstrations in a simulator.")
     parser.add_argument(
-        "--suite", default="ml10", help=f"all its tasks: {', '.join(SIMULATORS)} (ml10)"
+        "--suite", default="ml10", help=f"whose tasks, one of {', '.join(SIMULATORS)} (ml10)"
     )
     parser.add_argument("--task", help="only this task")
     parser.add_argument("--data", default="data", help="folder of the files (data)")
     parser.add_argument(
-        "--episodes", type=int, help="successful ones a task (10 or 5, as the suite says)"
+        "--episodes", type=int, help="successful episodes a task (10 or 5, as the suite says)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of objects and goals, 0 to 999 (0)")
     parser.add_argument("--workers", type=int, help="processes (one a core)")

@@ -12,7 +12,7 @@ open. They also have one instruction, which does not say which of the two is mea
 novel tasks.
 
 `convention-reach` and `convention-push`: the goal is seen, but each task turns the x-y part of the
-action by an angle of its own. It is as if nobody knew how the base of a robot is mounted. What a
+action by an angle of its own. It is like a robot whose base is mounted at an unknown angle. What a
 task's actions do can be learned only from observations together with actions: the cloud alone shows
 where the hand has to go, and not what moves it there.
 
@@ -159,8 +159,9 @@ class PairEnv(MetaWorldPointCloudEnv):
 # ---- Turned actions ------------------------------------------------------------------------------
 
 SKILLS = ("reach", "push")
-# The angles of each kind in degrees: to train on, to choose by, and to measure on. Each angle of
-# the last two kinds lies in the middle between two of the first. Tasks are called after them.
+# The angles of each kind in degrees: for training, for choosing settings, and for results. Each
+# angle of the last two kinds lies in the middle between two of the first. Tasks are called after
+# them.
 ANGLES = {
     "base": [22.5 * i for i in range(16)],
     "validation": [33.75 + 90.0 * i for i in range(4)],
@@ -180,7 +181,7 @@ def angle_of(task: str) -> float:
 
 def bound_norm(action: np.ndarray) -> np.ndarray:
     """Shortens the x-y part of an action (4,) to at most 1: turned, it stays within [-1, 1]."""
-    action = np.array(action, dtype=np.float64)  # float32 would be longer than 1 by rounding
+    action = np.array(action, dtype=np.float64)  # in float32, rounding could leave it longer than 1
     action[:2] /= max(1.0, np.linalg.norm(action[:2]))
     return action
 
@@ -288,7 +289,7 @@ class Conventions:
         """Returns the (base, novel) tasks of "convention-SKILL".
 
         In "convention-SKILL-validation" other angles stand in the place of the novel ones.
-        Whatever is chosen is chosen on those.
+        Settings are chosen on those.
         """
         name = suite.removeprefix("convention-")
         skill = name.removesuffix("-validation")
