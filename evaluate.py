@@ -277,14 +277,9 @@ def take_inner_steps(
     """
     adapted = copy.deepcopy(policy)
     generator = torch.Generator().manual_seed(seed)
-    support = {
-        "text": text[None],
-        **sampler.batch(batch, generator),
-        **adapted.draw_noise_and_timesteps(batch, generator),
-    }
+    support = adapted.draw_batch(sampler, text, batch, generator)
     demonstration = {name: x for name, x in support.items() if name.startswith("demo_")}
     support.update(controlled(demonstration, demonstration_control))
-    support = {name: x.to(text.device) for name, x in support.items()}
 
     loss_fn = partial(model.loss_of, policy)
     params = {name: p.detach() for name, p in policy.named_parameters()}

@@ -148,12 +148,7 @@ def adapt_policy(
         gradient_of = CUDAGraphed(gradient_of)
 
     for step in range(1, steps + 1):  # line 6
-        drawn = {
-            "text": text[None],
-            **sampler.batch(batch, generator),  # line 7
-            **adapted.draw_noise_and_timesteps(batch, generator),  # line 10
-        }
-        drawn = {name: x.to(text.device) for name, x in drawn.items()}
+        drawn = adapted.draw_batch(sampler, text, batch, generator)  # lines 7 and 10
         loss, gradients = gradient_of(drawn)  # lines 8 to 14
         if not torch.isfinite(loss):
             raise UserError(

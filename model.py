@@ -873,6 +873,25 @@ class DAMIPolicy(nn.Module):
         timesteps = torch.randint(K, (n,), generator=generator, device=source)
         return {"noise": noise.to(device), "timesteps": timesteps.to(device)}
 
+    def draw_batch(
+        self, sampler: Any, text: Tensor, n: int, generator: Generator, support: int = 0
+    ) -> dict[str, Tensor]:
+        """Draws the arguments of `loss`: n windows, a demonstration, noise and timesteps.
+
+        Args:
+            sampler: a `data.WindowSampler` of one task.
+            text: the task's instruction feature (text_dim,); the batch is on its device.
+            n: windows.
+            generator: draws all of it.
+            support: see `WindowSampler.batch`.
+        """
+        batch = {
+            "text": text[None],
+            **sampler.batch(n, generator, support=support),
+            **self.draw_noise_and_timesteps(n, generator),
+        }
+        return {name: x.to(text.device) for name, x in batch.items()}
+
 
 class DP3Policy(DAMIPolicy):
     """DP3: the policy without demonstration and instruction."""

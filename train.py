@@ -174,11 +174,7 @@ def task_batch(
     """
     seed_of_batch, seed_of_dropout = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     generator = torch.Generator().manual_seed(int(seed_of_batch))
-    batch = {
-        "text": text[None],
-        **sampler.batch(n, generator, support=settings.support),
-        **policy.draw_noise_and_timesteps(n, generator),
-    }
+    batch = policy.draw_batch(sampler, text, n, generator, support=settings.support)
 
     generator = torch.Generator().manual_seed(int(seed_of_dropout))
     drop_instruction, drop_task = torch.rand(2, generator=generator)
@@ -190,7 +186,7 @@ def task_batch(
         dropped = ()
     for name in dropped:
         batch[name] = torch.zeros_like(batch[name])
-    return {name: x.to(text.device) for name, x in batch.items()}
+    return batch
 
 
 def multi_task_loss(policy: DAMIPolicy, batches: list[dict[str, Tensor]]) -> Tensor:
