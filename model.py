@@ -674,6 +674,10 @@ class DAMIPolicy(nn.Module):
             if value != needed:
                 raise ConfigError(f"policy {config.policy} needs {name} {needed!r}, not {value!r}")
 
+    @property
+    def device(self) -> torch.device:
+        return self.normalizer.action_scale.device
+
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The parameters by adaptation learning rate: `vision`, `diffusion`, `other` (VMT, U2T)."""
         groups = {"vision": [], "diffusion": [], "other": []}
@@ -868,10 +872,10 @@ class DAMIPolicy(nn.Module):
         They are on the policy's device, whatever the generator's.
         """
         H, A, K = self.config.horizon, self.config.action_dim, self.config.diffusion_steps
-        source, device = generator.device, self.normalizer.action_scale.device
+        source = generator.device
         noise = torch.randn(n, H, A, generator=generator, device=source)
         timesteps = torch.randint(K, (n,), generator=generator, device=source)
-        return {"noise": noise.to(device), "timesteps": timesteps.to(device)}
+        return {"noise": noise.to(self.device), "timesteps": timesteps.to(self.device)}
 
     def draw_batch(
         self, sampler: Any, text: Tensor, n: int, generator: Generator, support: int = 0

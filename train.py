@@ -348,7 +348,7 @@ def meta_train(
     through_inner_step = partial(
         maml_gradient, policy, log_rates=state.log_rates, settings=settings, vectorize=vectorize
     )
-    if next(policy.parameters()).is_cuda and len(lengths) == 1 and world == 1:
+    if policy.device.type == "cuda" and len(lengths) == 1 and world == 1:
         without_inner_step = CUDAGraphed(without_inner_step)
         through_inner_step = CUDAGraphed(through_inner_step)
 
@@ -485,9 +485,7 @@ def restore(path: Path, state: TrainingState, settings: Settings, digest: str) -
     """
     policy, config = state.policy, state.policy.config
     averaged, info = model.load(
-        path,
-        policy.normalizer.action_scale.device,
-        needs=(*evaluate.TRAINED, "training", "recordings", "provenance"),
+        path, policy.device, needs=(*evaluate.TRAINED, "training", "recordings", "provenance")
     )
 
     try:
