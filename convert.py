@@ -87,7 +87,7 @@ def refuse_damaged(path: Path, error: Exception, expected: str) -> NoReturn:
 
 @contextmanager
 def reading(path: Path, expected: str) -> Iterator[None]:
-    """Stands around one call of a library: whatever that raises, the file cannot be read."""
+    """Turns whatever a library raises inside into a RecordingError that names the file."""
     try:
         yield
     except MemoryError:
@@ -481,9 +481,9 @@ IN_ZARR = {
 
 def read_zarr(path: Path, options: Options) -> Source:
     """A replay buffer of DP3."""
-    check_flags(path, options, "a zarr of DP3", ("feature", "state", "wrist"))
     arrays, unread = open_zarr(path)
     check_zarr(path, arrays)
+    check_flags(path, options, "a zarr of DP3", ("feature", "state", "wrist"))
     check_color_has_no_name(path, options)
     with reading(path, "no zarr"):
         ends, state, action = (arrays[part][:] for part in ("ends", "state", "action"))
@@ -929,8 +929,10 @@ class Video:
             for picture in readable(container.decode(video=0), file, "no video"):
                 if pixel_format == "gray12le" and picture.format.components[0].bits != 12:
                     refuse(file, f"is {picture.format.name}, not depth in 12 bits")
-                seconds = float(picture.pts * picture.time_base)
-                yield seconds, picture.to_ndarray(format=pixel_format)
+                with reading(file, "no video"):
+                    seconds = float(picture.pts * picture.time_base)
+                    image = picture.to_ndarray(format=pixel_format)
+                yield seconds, image
 
 
 # ---- HDF5 of robomimic and ManiSkill -------------------------------------------------------------

@@ -318,8 +318,8 @@ def is_numbers(value: Any, shape: tuple[int, ...]) -> bool:
     """Whether a value from JSON is finite numbers of that shape, and no text or bool."""
     numbers = np.array(value, dtype=object)
     return numbers.shape == shape and all(
-        type(x) in (int, float) and abs(x) < 1e30
-        for x in numbers.flat  # False for NaN, too
+        type(x) in (int, float) and abs(x) < 1e30  # False for NaN, too
+        for x in numbers.flat
     )
 
 
@@ -471,7 +471,7 @@ def read_text(path: Path, name: str, array: np.ndarray) -> str:
 
 # ---- Suspicions ----------------------------------------------------------------------------------
 
-SPREADS = 20  # an outlier lies more than this many times the usual range outside of that range
+SPREADS = 20  # an outlier is outside the usual range by more than this many times its width
 SCENE = (0.05, 10.0)  # metres: the diagonal of what a manipulator works on
 LAGS = range(-2, 3)  # frames by which actions may be shifted
 

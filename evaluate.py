@@ -415,7 +415,7 @@ def take_actions(
     history: deque[dict[str, np.ndarray]],
     stop_at_success: bool,
 ) -> tuple[list[bool], bool]:
-    """Takes the actions of a chunk (Ta, A); `history` is given what is seen after the last To.
+    """Takes the actions of a chunk (Ta, A); `history` gets what is seen after each of the last To.
 
     Returns whether each step reported success, and whether the episode ended. An episode in which
     nothing is left to observe ends there, and its last step counts as no success.
@@ -839,7 +839,7 @@ def write_animation(
                 text=text[sampler.task],
                 generator=torch.Generator().manual_seed(episode_seed),
             )
-            environment.success = successes[-1][-1]  # none, where nothing is seen any more
+            environment.success = successes[-1][-1]  # False if it ended because nothing was seen
             environment.film()  # how it ended
             films[sampler.task] = environment.frames
     animate(films, writer, path)
@@ -1026,7 +1026,7 @@ class Checkpoint:
 
     path: Path
     label: str  # its column in tables and charts: the run's folder and the file's name
-    policy: str  # as in PolicyConfig.policy
+    config: model.PolicyConfig
     info: dict[str, Any]  # what the file says beside the weights, see TRAINED
 
 
@@ -1047,7 +1047,7 @@ def choose_checkpoints(
         for file in files if top else files[-1:]:
             policy, info = load_trained(file, **config_overrides)
             label = f"{file.resolve().parent.name}/{file.stem}"
-            run.append(Checkpoint(file, label, policy.config.policy, info))
+            run.append(Checkpoint(file, label, policy.config, info))
         runs.append(run)
 
     labels = [checkpoint.label for checkpoint in chain(*runs)]
@@ -1153,6 +1153,15 @@ def choose_measurements(
     return [*measurements, *with_other_inputs]
 
 
+def recipe_of(checkpoint: Checkpoint) -> tuple:
+    """What makes a policy, but for its seed and for when it was saved and evaluated."""
+    no_matter = ("seed", "vectorize", "checkpoint_every", "evaluate_every", "episodes")
+    arguments = {
+        name: value for name, value in checkpoint.info["arguments"].items() if name not in no_matter
+    }
+    return checkpoint.config, arguments, checkpoint.info.get("adaptation")
+
+
 def mean_successes(
     outcomes: dict[str, Outcomes], runs: list[list[Checkpoint]], parts: Parts, top: int
 ) -> dict[str, str]:
@@ -1160,9 +1169,8 @@ def mean_successes(
 
     They are of success at any step. Runs are averaged if only their seeds differ.
     """
-    recipes = [{**run[-1].info["arguments"], "seed": None} for run in runs]
-    policies = {run[-1].policy for run in runs}
-    if len(policies) > 1 or any(recipe != recipes[0] for recipe in recipes):
+    recipes = [recipe_of(run[-1]) for run in runs]
+    if any(recipe != recipes[0] for recipe in recipes):
         means = {}
         for run in runs:
             for name, mean in mean_successes(outcomes, [run], parts, top).items():
@@ -1319,7 +1327,7 @@ def measure(
         shown,
         provenance,
         parts=parts,
-        paper=paper_columns(suite, dict.fromkeys(run[-1].policy for run in runs)),
+        paper=paper_columns(suite, dict.fromkeys(run[-1].config.policy for run in runs)),
         checkpoints={c.label: outcomes[c.label] for c in chain(*runs)} if args.top else None,
         pooled=info["arguments"].get("evaluate_on") == "novel" and len(shown) > 1,
     )
@@ -1348,8 +1356,8 @@ def main(argv: list[str] | None = None) -> None:
     for checkpoint in chain(*runs):
         if choose_tasks(args, simulator, suite, checkpoint.info) != tasks:
             raise UserError(
-                f"{checkpoint.path} and {runs[0][-1].path} are for different tasks: "
-                "name --task, or measure each alone"
+                f"{checkpoint.path} and {runs[0][-1].path} are for different tasks: measure each "
+                "alone, or, unless one was adapted to a task, name --task"
             )
     if args.swap and len(tasks) < 2:
         raise UserError(

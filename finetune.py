@@ -407,6 +407,10 @@ def check_flags(args: argparse.Namespace, settings: Settings) -> None:
         common.choose(args.suite, SIMULATORS, "suite")
     if settings.inner_steps is None and settings.inner_lr is not None:
         raise UserError("--inner-lr is the learning rate of --inner-steps: give both")
+    if settings.inner_steps is not None and args.n_action_steps is not None:
+        raise UserError(
+            "--n-action-steps also changes the windows that --inner-steps learn from: leave out one"
+        )
     if settings.inner_steps is not None:
         of_algorithm_2 = ("steps", "curve", "lr_vision", "lr_diffusion", "lr_other")
         given = [name for name in of_algorithm_2 if getattr(args, name) not in (None, [])]
@@ -478,6 +482,8 @@ def read_measured(
     for task, adaptation in adaptations.items():
         folder = adaptation.folder
         if not (folder / "config.json").is_file():  # it is written when the adaptation is finished
+            if (folder / "success.json").is_file():  # which is written after it
+                raise UserError(f"{folder} holds other results: choose another --out")
             continue
         try:
             config = json.loads((folder / "config.json").read_text())

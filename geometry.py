@@ -1,6 +1,7 @@
 """Poses and points: what a robot, and the importers of recordings, compute with them.
 
-A pose is six numbers (6,): a position in metres, then a rotation vector in radians, in one frame.
+A pose is six numbers (6,), a position in metres and a rotation vector in radians in one frame; that
+of a camera is a matrix (4, 4).
 An action is a change of the pose, whose rotation is applied after the present one (see `compose`).
 Depth is metres along the viewing direction. Nothing of the project is imported.
 """

@@ -1052,7 +1052,7 @@ def load(
             f"{path} is of another version of the code, with settings that are unknown here: "
             f"{', '.join(unknown)}"
         )
-    if config.get("policy", "dami") not in tuple(POLICIES):  # which no list can be a key of
+    if config.get("policy", "dami") not in tuple(POLICIES):  # a damaged file may hold a list
         raise CheckpointError(
             f"{path}: policy {config['policy']!r} is unknown: import the file that adds it first, "
             "such as baselines.py"

@@ -1,10 +1,10 @@
-"""What is made of results: success rates with their intervals, tables, charts, pictures.
+"""What is made of results: success rates with their intervals, tables, charts, animations.
 
 85.0 [64.0, 94.8]     17 of 20 episodes, in percent, and Wilson's 95 % interval
 82.2 ± 1.9 (3 runs)   the mean of runs of several seeds, and Student's 95 % interval
 
-Nothing here knows a simulator or a policy: results are lists of successes by task, and whoever
-wants means of some of the tasks names them (`parts`). An episode may be a success at one step and
+Nothing here knows a simulator or a policy: results are lists of successes by task, and means of
+some of the tasks are asked for by name (`parts`). An episode may be a success at one step and
 no longer at the next, so success is counted at any step and at the end.
 
 Letters: T frames, N points.

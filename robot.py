@@ -120,7 +120,8 @@ class Settings:
 
     The first five have no default, because they depend on where the arm is mounted. Raises
     ValueError, in one line, for a value of the wrong type, out of range, or at odds with another.
-    Every motion is checked by `check_steps` and `check_poses` before it is sent.
+    Actions are checked by `check_steps` and `check_poses` before they are sent; a way that
+    `Servo.go` takes by `check_poses`, at both ends.
     """
 
     tcp_low_m: tuple = setting(MISSING, "lower corner of the box that the TCP stays in", **CORNER)
@@ -517,7 +518,8 @@ class RTDE:
                 readable, _, _ = select.select([self.socket], [], [], 0)
             except (OSError, ValueError):  # closed meanwhile
                 raise self.lost("connection closed") from None
-            raise StaleState(f"{self.name}: the newest state is {age:.3f} s old", bool(readable))
+            message = str(self.lost(f"the newest state is {age:.3f} s old"))
+            raise StaleState(message, arrived=bool(readable))
         return self.newest
 
     def send(self, pose: np.ndarray, stop: bool = False) -> None:
@@ -1181,7 +1183,7 @@ class Servo:
                 reason = f", but newer ones have arrived{self.describe_stall()}"
             else:
                 reason = ", and no newer one has arrived: look for the network or the controller"
-            raise RobotError(f"{error}{reason}{self.rtde.controller_said}") from error
+            raise RobotError(f"{error}{reason}") from error
         now = time.monotonic()
         if now - self.last_step[0] > MISSING_PACKAGES / settings.servo_hz:
             self.stall = self.describe_stall()
@@ -1295,7 +1297,7 @@ class Servo:
                 "cut short"
             )
         if not self.lateness:
-            return "nothing was sent: the stream had not begun"
+            return "the stream had not begun"
         late = 1000 * np.array(self.lateness)  # milliseconds
         oldest = 1000 * max(self.ages, default=0.0)
         sent = "packages" if self.moves else "steps, in which nothing was sent,"

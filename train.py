@@ -424,12 +424,14 @@ SAVE_SHARE = 0.04
 FREE_TO_CHANGE = ("vectorize", "checkpoint_every", "evaluate_every", "episodes")
 # These, too, may differ while no inner step has been taken.
 OF_INNER_STEP = ("maml", "inner_lr", "learn_inner_lr", "rate_lr", "task_dropout")
-# These follow from the recordings, which are compared by themselves.
+
+
+# These follow from recordings.
 OF_RECORDINGS = ("point_dim", "state_dim", "action_dim", "demo_positions")
 
 
 def is_due(step: int, every: int, settings: Settings) -> bool:
-    """Whether what is done every so many steps, and after the last one, is done after this step."""
+    """Whether something that is done every `every` steps and after the last is done after this."""
     return step == settings.steps or step % every == 0
 
 
@@ -492,7 +494,9 @@ def restore(path: Path, state: TrainingState, settings: Settings, digest: str) -
         settings_then = Settings(**info["arguments"])  # newer fields take their defaults
     except TypeError as error:
         raise UserError(f"{path} is of another version of the code: {error}") from error
-    may_differ = {*FREE_TO_CHANGE, *OF_RECORDINGS}
+    may_differ = set(FREE_TO_CHANGE)
+    if info["recordings"] != digest:  # as is said below
+        may_differ.update(OF_RECORDINGS)
     if info["step"] <= min(settings.pretrain_steps, settings_then.pretrain_steps):
         may_differ.update(OF_INNER_STEP)
     differences = []
@@ -735,7 +739,7 @@ def heldout_controls(
     settings: Settings,
     inner_lr: InnerRate,
 ) -> dict[str, np.ndarray]:
-    """Held-out errors (A,) by title, means over tasks: with wrong demonstrations, and after steps.
+    """Title -> held-out errors (A,), means over tasks: with other demonstrations or after steps.
 
     They stand in for the rollouts of `Evaluation.contributions` where nothing can be rolled out.
     """
@@ -1057,7 +1061,7 @@ def check_same_weights(identity: str, world: int) -> None:
 
 
 def check_folder(folder: Path, resume: bool) -> None:
-    """Raises UserError for a run that cannot be resumed, or what a new one would overwrite."""
+    """Raises UserError if a run cannot be resumed, or if a new one would overwrite something."""
     if resume:
         if not (folder / "last.pt").exists():
             raise UserError(f"there is no run to resume in {folder}: look at --out")
@@ -1101,7 +1105,7 @@ def begin_files(
     write_text(folder / "config.json", json.dumps(content, indent=1))
 
     path = folder / "metrics.jsonl"
-    kept = [line for line in read_json_lines(path) if line.get("step", 0) <= step] if step else []
+    kept = [line for line in read_json_lines(path) if line["step"] <= step] if step else []
     write_text(path, "".join(f"{json.dumps(line)}\n" for line in kept))
 
 

@@ -89,7 +89,7 @@ AGAIN = "-goals2"  # the same report on as many other goals
 class Report:
     """A measurement of a run."""
 
-    command: str  # {run} is the run's folder. Its own --seed and --episodes win over the plan's
+    command: str  # {run} is the run's folder. A --seed or --episodes in it wins over the plan's
     variants: Sequence[str]  # that it measures
 
 
@@ -207,10 +207,7 @@ TURNED_MULTI_TASK_RATES = {1: 0.01, 5: 0.03}
 
 
 def angles_apart(skill: str) -> list[str]:
-    """The tasks of the eight new angles, each 135 degrees after the one before it.
-
-    That holds for the first, which comes after the last, too.
-    """
+    """The tasks of the eight new angles, in a circle in which the next is 135 degrees further."""
     angles = ANGLES["novel"]
     return [turned_task(skill, angles[3 * i % len(angles)]) for i in range(len(angles))]
 

@@ -495,6 +495,9 @@ def test_resuming_several_tasks_removes_no_policy_of_one(run, recorded, capsys):
         several = adapting(run, recorded, "--episodes 0 --out project --resume", "door-close reach")
         assert f"{folder} holds other results" in fails(finetune, several, capsys)
         (folder / "config.json").unlink()
+    Path("project/door-close/success.json").write_text("{}")  # as evaluate.py leaves it
+    assert "project/door-close holds other results" in fails(finetune, several, capsys)
+    assert Path("project/door-close/success.json").exists()
 
     # Nor a policy that was adapted otherwise and not rolled out
     argv = adapting(run, recorded, "--episodes 0 --out both", "door-close reach")

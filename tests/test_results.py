@@ -14,6 +14,7 @@ from common import UserError
 from hidden_goals import SKILLS, names_of
 from model import PRESETS, PolicyConfig
 from report import mean_interval, wilson_interval
+from tests import oracle
 from tests.oracle import WORLDS
 from tests.results import (
     HIDDEN_ROWS,
@@ -288,13 +289,14 @@ def test_runs_of_today_are_those_of_the_queue_and_say_how_they_were_measured():
         suite, variant = re.fullmatch(rf"({suites})-(.+)-seed\d", name).groups()
         plan = plan_of(suite)
         check_training(name, suite, plan.variants[variant])
-        world = f"-m tests.oracle {variant} " if variant in WORLDS else "python "
-        assert world in run["training"]["command"], name
+        commands = [record.get("provenance", record)["command"] for record in run.values()]
+        for command in commands:
+            world = re.findall(r"tests\.oracle (\S+)", command)
+            assert world == ([variant] if variant in WORLDS else []), (name, command)
         for part in run.keys() - {"training"}:
             report, provenance = plan.reports[part], run[part]["provenance"]
             assert variant in report.variants, (name, part)
             assert {"command", "hardware", "date"} <= set(provenance)
-            assert world in provenance["command"], (name, part)
             flags = f"--seed {SEED} --episodes {plan.episodes} {report.command}"
             seed = int(re.findall(r"--seed (\d+)", flags)[-1])  # the last one wins
             episodes = int(re.findall(r"--episodes (\d+)", flags)[-1])
@@ -322,7 +324,9 @@ def test_every_command_of_the_queue_parses(suite):
     for variant in variants:
         for job in jobs_of_run(variant, 0, suite=suite, flags="", episodes=5, only=None):
             words = job.command.split()
-            script, *flags = words[3:] if words[0] == "-m" else words  # behind tests.oracle WORLD
+            if words[0] == "-m":  # behind tests.oracle WORLD
+                assert oracle.parse(words[2:]).world == variant
+            script, *flags = words[3:] if words[0] == "-m" else words
             importlib.import_module(script.removesuffix(".py")).parse(flags)
 
 

@@ -1096,7 +1096,7 @@ def test_the_librealsense_library_delivers_synthetic_depth():
     sensor.on_video_frame(frame)
     received = queue.wait_for_frame(1000).as_depth_frame()
     depth = np.asarray(received.get_data()).astype(np.float32) * unit
-    ours = robot.depth_to_points(depth, robot.realsense_intrinsics(received.profile))
+    ours = geometry.depth_to_points(depth, robot.realsense_intrinsics(received.profile))
     pointcloud = rs.pointcloud()
     theirs = (
         np.asarray(pointcloud.calculate(received).get_vertices()).view(np.float32).reshape(-1, 3)
