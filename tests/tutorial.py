@@ -6,7 +6,9 @@ A digest of the code that ran is kept with the outputs: tests/test_notebook.py c
 code that stands there.
 """
 
+import argparse
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import nbformat
@@ -45,7 +47,12 @@ def join_streams(cell: nbformat.NotebookNode) -> None:
     cell.outputs = outputs
 
 
-def main() -> None:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    return argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parse(argv)
     notebook = nbformat.read(TUTORIAL, as_version=4)
     folder = {"metadata": {"path": str(TUTORIAL.parent)}}
     NotebookClient(notebook, timeout=3600, kernel_name="python3", resources=folder).execute()
