@@ -127,6 +127,14 @@ def of_next_task(inputs: dict[str, Any]) -> dict[str, Any]:
 SHIPPED_CHECKPOINT = Path(__file__).parent / "assets" / "ml10-small.pt"
 # What train.py saves in a checkpoint beside the weights
 TRAINED = ("suite", "preset", "arguments", "text_weights", "step")
+# Settings of train.py that may differ when a run is resumed, and between runs that are averaged.
+# Only `vectorize` changes weights, in their last bits.
+FREE_TO_CHANGE = ("vectorize", "checkpoint_every", "evaluate_every", "episodes")
+
+
+def ema_checkpoint(folder: Path, step: int) -> Path:
+    """The file in a run's folder that holds the moving average after a step."""
+    return folder / f"ema-{step:05d}.pt"
 
 
 def checkpoints_of(path: str | Path) -> list[Path]:
@@ -163,7 +171,7 @@ def default_checkpoint(suite: str) -> Path:
     for config in Path("runs").glob("*/config.json"):
         with suppress(OSError, ValueError, KeyError, TypeError):  # of a damaged file
             arguments = json.loads(config.read_text())["arguments"]
-            last = config.parent / f"ema-{arguments['steps']:05d}.pt"
+            last = ema_checkpoint(config.parent, arguments["steps"])
             if arguments["suite"] == suite and last.is_file():
                 runs_of_preset = tiny if arguments["preset"] == "tiny" else finished
                 runs_of_preset.append(last)
@@ -1131,35 +1139,36 @@ def choose_measurements(
     measurements, with_other_inputs = [], []
     for run in runs:
         for checkpoint in run:
-            own = Measurement(
+            measurement = Measurement(
                 label=checkpoint.label,
                 checkpoint=checkpoint.path,
                 recordings=recordings,
                 text=text,
                 demonstration_control="zeros" if "demonstration" in args.without else None,
             )
-            measurements.append(own)
-        for control in args.controls:  # from here on, `own` is the run's last checkpoint
+            measurements.append(measurement)
+        last = measurements[-1]  # of this run
+        for control in args.controls:
             with_other_inputs.append(
-                replace(own, label=f"{own.label}, {control}", demonstration_control=control)
+                replace(last, label=f"{last.label}, {control}", demonstration_control=control)
             )
         for name in args.swap:
-            label = f"{own.label}, {name} of another task"
+            label = f"{last.label}, {name} of another task"
             if name == "demonstration":
-                other = replace(own, label=label, recordings=of_next_task(recordings))
+                other = replace(last, label=label, recordings=of_next_task(recordings))
             else:
-                other = replace(own, label=label, text=of_next_task(text))
+                other = replace(last, label=label, text=of_next_task(text))
             with_other_inputs.append(other)
     return [*measurements, *with_other_inputs]
 
 
 def recipe_of(checkpoint: Checkpoint) -> tuple:
-    """What makes a policy, but for its seed and for when it was saved and evaluated."""
-    no_matter = ("seed", "vectorize", "checkpoint_every", "evaluate_every", "episodes")
-    arguments = {
-        name: value for name, value in checkpoint.info["arguments"].items() if name not in no_matter
-    }
-    return checkpoint.config, arguments, checkpoint.info.get("adaptation")
+    """What makes a policy, but for its seed: architecture, training and adaptation."""
+    training = {}
+    for name, value in checkpoint.info["arguments"].items():
+        if name not in ("seed", *FREE_TO_CHANGE):
+            training[name] = value
+    return checkpoint.config, training, checkpoint.info.get("adaptation")
 
 
 def mean_successes(

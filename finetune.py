@@ -407,11 +407,12 @@ def check_flags(args: argparse.Namespace, settings: Settings) -> None:
         common.choose(args.suite, SIMULATORS, "suite")
     if settings.inner_steps is None and settings.inner_lr is not None:
         raise UserError("--inner-lr is the learning rate of --inner-steps: give both")
-    if settings.inner_steps is not None and args.n_action_steps is not None:
-        raise UserError(
-            "--n-action-steps also changes the windows that --inner-steps learn from: leave out one"
-        )
     if settings.inner_steps is not None:
+        if args.n_action_steps is not None:
+            raise UserError(
+                "--n-action-steps also changes the windows that --inner-steps learn from: "
+                "leave out one"
+            )
         of_algorithm_2 = ("steps", "curve", "lr_vision", "lr_diffusion", "lr_other")
         given = [name for name in of_algorithm_2 if getattr(args, name) not in (None, [])]
         if args.normalizer == "fit":

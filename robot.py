@@ -1893,7 +1893,8 @@ def record_episodes(
         meta = cell.describe()
         if kept is not None:
             check_same_robot(kept, meta)
-        meta |= {"made_by": "robot.record", "camera": args.camera}
+        meta["made_by"] = "robot.record"
+        meta["camera"] = args.camera
         servo = Servo(cell.rtde, settings, free=True, activity=cell.activity)
         cell.prepare(servo)
         recorder = Recorder(args=args, cell=cell, out=out, meta=meta, kept=kept)

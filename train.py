@@ -420,9 +420,7 @@ def meta_train(
 SAVE_SECONDS = 20
 SAVE_SHARE = 0.04
 
-# These may differ when a run is resumed. Only `vectorize` changes weights, in their last bits.
-FREE_TO_CHANGE = ("vectorize", "checkpoint_every", "evaluate_every", "episodes")
-# These, too, may differ while no inner step has been taken.
+# Beside `evaluate.FREE_TO_CHANGE` these may differ while no inner step has been taken.
 OF_INNER_STEP = ("maml", "inner_lr", "learn_inner_lr", "rate_lr", "task_dropout")
 
 
@@ -441,14 +439,9 @@ def is_milestone(step: int, settings: Settings) -> bool:
     return any(is_due(step, n, settings) for n in every)
 
 
-def checkpoint_after(step: int, folder: Path) -> Path:
-    """The file in a run's folder that holds the moving average after a step."""
-    return folder / f"ema-{step:05d}.pt"
-
-
 def save_average(folder: Path, state: TrainingState, info: dict[str, Any]) -> None:
     """Writes the moving average, and `info`, to the checkpoint of this step."""
-    path = checkpoint_after(state.step, folder)
+    path = evaluate.ema_checkpoint(folder, state.step)
     model.save(path, state.average.module, **state.progress(), **info)
 
 
@@ -494,7 +487,7 @@ def restore(path: Path, state: TrainingState, settings: Settings, digest: str) -
         settings_then = Settings(**info["arguments"])  # newer fields take their defaults
     except TypeError as error:
         raise UserError(f"{path} is of another version of the code: {error}") from error
-    may_differ = set(FREE_TO_CHANGE)
+    may_differ = set(evaluate.FREE_TO_CHANGE)
     if info["recordings"] != digest:  # as is said below
         may_differ.update(OF_RECORDINGS)
     if info["step"] <= min(settings.pretrain_steps, settings_then.pretrain_steps):
@@ -606,7 +599,7 @@ class Evaluation:
                     return logged  # otherwise --episodes was another then
         try:
             with stop.suspended():
-                outcomes = self.roll_out(checkpoint_after(step, self.folder))
+                outcomes = self.roll_out(evaluate.ema_checkpoint(self.folder, step))
         except KeyboardInterrupt:
             raise KeyboardInterrupt("all is saved, add --resume to go on") from None
         append_json(
@@ -633,7 +626,7 @@ class Evaluation:
         demonstration is read. It also animates the first two tasks, from one seed.
         """
         settings = self.settings
-        checkpoint = checkpoint_after(settings.steps, self.folder)
+        checkpoint = evaluate.ema_checkpoint(self.folder, settings.steps)
         own_title = "own demonstration" if reads_demonstration else "no demonstration"
         # Title -> whose demonstrations are read, and the control of `evaluate.controlled`
         inputs: dict[str, tuple[dict[str, Path], str | None]] = {own_title: (self.recordings, None)}
@@ -1227,7 +1220,7 @@ def run(
     outcomes = None
     with StopRequest() as stop, bar:
         if rank == 0 and state.step > 0:
-            checkpoint = checkpoint_after(state.step, folder)
+            checkpoint = evaluate.ema_checkpoint(folder, state.step)
             if is_milestone(state.step, settings) and not checkpoint.exists():
                 # Missing where --checkpoint-every or --evaluate-every changed on --resume
                 save_average(folder, state, checkpoint_info)

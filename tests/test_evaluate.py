@@ -1024,13 +1024,21 @@ def test_an_episode_in_which_nothing_is_seen_any_more_is_filmed_as_the_failure_t
     monkeypatch.setattr(evaluate, "animate", lambda *x: (films.append(x[0]), animate(*x)))
     sampler = data.WindowSampler(data.load_demonstrations(recordings["touch-red"]), TINY)
     text, _ = features(["touch-red"], None, None)
-    arguments = [trained, Simulator(), [sampler], {"touch-red": text[0]}]
+    animated = partial(
+        evaluate.write_animation,
+        policy=trained,
+        simulator=Simulator(),
+        samplers=[sampler],
+        text={"touch-red": text[0]},
+        seed=2,
+        path=Path("x.gif"),
+    )
     if hidden:
         message = "touch-red: nothing is seen at the start of the episode of seed"
         with pytest.raises(evaluate.UserError, match=message):
-            evaluate.write_animation(*arguments, seed=2, path=Path("x.gif"))
+            animated()
         return
-    [successes] = evaluate.write_animation(*arguments, seed=2, path=Path("x.gif"))
+    [successes] = animated()
     [film] = films
     assert successes == [True] * 7 + [False]
     assert [frame.success for frame in film["touch-red"]][-2:] == [True, False]

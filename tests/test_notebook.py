@@ -118,7 +118,7 @@ def test_a_section_of_the_tutorial_needs_the_set_up_and_nothing_else():
         for tree in cells:
             bound, read = names(tree)
             assert read <= here | bound, read - here - bound
-            here |= bound_for_later_cells(tree)
+            here.update(bound_for_later_cells(tree))
 
 
 def test_a_task_is_named_in_one_cell_of_the_tutorial():
