@@ -433,9 +433,9 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     if missing := [name for name in FIELDS if name not in arrays]:
         raise RecordingError(f"{path} is no file of demonstrations: it lacks {', '.join(missing)}")
 
-    task, instruction, meta = (
-        read_text(path, name, arrays[name]) for name in ("task", "instruction", "meta")
-    )
+    task = read_text(path, "task", arrays["task"])
+    instruction = read_text(path, "instruction", arrays["instruction"])
+    meta = read_text(path, "meta", arrays["meta"])
     try:
         demonstrations = Demonstrations(
             task=task,

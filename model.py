@@ -353,8 +353,10 @@ class UnpairedUnifiedTask(nn.Module):
         return tokens
 
     def encode_context(self, demo_tokens: Tensor | None, text: Tensor) -> tuple[Tensor, ...]:
-        """What the windows of D tasks share: with one layer the keys and the values of their
-        tokens, each (D, heads, T + 1, C / heads); with more, the tokens (D, T + 1, C).
+        """Returns what all windows of a task share, for D tasks.
+
+        With one layer these are the keys and the values of the tasks' tokens, each
+        (D, heads, T + 1, C / heads); with more, the tokens (D, T + 1, C).
         """
         tokens = self.embed(demo_tokens, text)
         if len(self.blocks) > 1:
