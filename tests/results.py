@@ -65,34 +65,20 @@ DIFFICULTY = {  # as DP3 groups Meta-World's tasks, after Seo et al. (2022); the
     "very hard": "disassemble pick-place-wall shelf-place stick-pull stick-push",
 }
 # Runs whose names begin with "old-" had the camera and the recipe of 2026-11-27.
-VARIANTS = {  # a run's name without its seed -> what it is
+OLD_VARIANTS = {  # of ML10: a run's name without its seed -> what it is
     "old-ml10-dami": "DAMI",
     "old-ml10-first-order": "DAMI, first order",
-    "old-ml10-first-order-3e-2": "DAMI, first order, with an inner rate of 3e-2",
-    "old-ml10-dami-cpu": "DAMI, trained on the CPU",
     "old-ml10-no-inner-loop": "without the inner loop",
-    "old-ml10-no-inner-loop-cpu": "without the inner loop, trained on the CPU",
-    "old-ml10-mlp": "without the inner loop, an MLP for VMT",
+    "old-ml10-no-inner-loop-cpu": "without the inner loop, trained on the CPU alone",
     "old-ml10-no-demonstration": "without a demonstration",
     "old-ml10-neither": "without both: multi-task training",
-    "old-ml10-30-demonstrations": "multi-task training, thirty demonstrations",
-    "old-ml10-scratch": "from random weights",
-    "old-ml45-no-inner-loop": "ML45, without the inner loop",
 }
 SWAPPED = {  # a run -> its panel in the swap chart
-    "before-seed0": "DAMI, always told its instruction",
-    "old-ml10-dami-seed0": "DAMI, seed 0",
-    "old-ml10-no-inner-loop-cpu-seed0": "no inner loop, on the CPU, seed 0",
+    "ml10-small-seed0": "DAMI",
+    "ml10-no-inner-loop-seed0": "DAMI without the inner loop",
 }
 POLICIES = {  # of baselines.py -> what the paper calls it
     policy: name for policy, name in PAPER_NAMES.items() if policy not in ("dami", "rl")
-}
-ABLATION = {  # a row of the paper's ablation -> our variant, and what it is
-    "baseline": ("baseline", "an MLP for VMT, no TCFM: the paper's Baseline"),
-    "+vmt": ("vmt", "VMT, no TCFM"),
-    "+tcfm-down": ("no-inner-loop-cpu", "VMT, TCFM in the first down-sampling level"),
-    "+tcfm-mid": ("mid", "VMT, TCFM in the middle"),
-    "+tcfm-up": ("up", "VMT, TCFM in the last up-sampling level"),
 }
 LIMITS = {  # what multi-task training may lack -> what it is given
     "neither": "`small` as it is: 10 demonstrations, 128 points, 84 x 84 rays, 10 000 steps",
@@ -117,12 +103,11 @@ TUNING = {  # a short multi-task training -> what it is
 }
 # A group (a suite, or "old-" and a suite) -> the columns of its tables: a variant, and its title.
 SHOWN = {
-    "ml10": {"ml10-dami": "DAMI", "ml10-neither": "multi-task"},
-    "old-ml10": {
-        "old-ml10-dami": "DAMI",
-        "old-ml10-no-inner-loop": "no inner loop",
-        "old-ml10-no-demonstration": "no demonstration",
-        "old-ml10-neither": "multi-task",
+    "ml10": {
+        "ml10-dami": "DAMI",
+        "ml10-no-inner-loop": "no inner loop",
+        "ml10-no-demonstration": "no demonstration",
+        "ml10-neither": "multi-task",
     },
     "old-ml45": {
         "old-ml45-dami": "DAMI",
@@ -384,13 +369,11 @@ def difficulty_table(results: Results, group: str) -> str:
     return format_table(rows)
 
 
-def variants_table(results: Results) -> str:
-    """What decides: a row a variant of ML10; ML45 has a table of its own."""
+def old_variants_table(results: Results) -> str:
+    """A row a variant of ML10, by the older recipe."""
     rows = [["ML10", "base", "novel, no gradient step", "novel, 200 steps"]]
-    for variant, title in VARIANTS.items():
-        cells = [mean(results, variant, column) for column in (BASE, BEFORE, AFTER)]
-        if any(cells) and "ml45" not in variant:
-            rows.append([title, *cells])
+    for variant, title in OLD_VARIANTS.items():
+        rows.append([title, *(mean(results, variant, column) for column in (BASE, BEFORE, AFTER))])
     return format_table(rows)
 
 
@@ -427,15 +410,6 @@ def with_and_without(results: Results, plain: str, meta_trained: str) -> list[st
         for column in (BASE, AFTER)
         for variant in (plain, meta_trained)
     ]
-
-
-def ablation_table(results: Results) -> str:
-    """The rows of the paper's ablation, each with its mean there."""
-    rows = [["ML10, without the inner loop", "base", "novel", "paper, novel"]]
-    for name, (variant, title) in ABLATION.items():
-        cells = [mean(results, f"old-ml10-{variant}", column) for column in (BASE, AFTER)]
-        rows.append([title, *cells, f"{np.mean(PAPER['ml10']['novel_ablation'][name]):.1f}"])
-    return format_table(rows)
 
 
 def length_table(results: Results) -> str:
@@ -506,17 +480,6 @@ def swap_table(results: Results) -> str:
         if any(label in columns for columns in policies.values()):
             cells = [pooled_success(c[label]) if label in c else "" for c in policies.values()]
             rows.append([label, *cells])
-    return format_table(rows)
-
-
-def reading_table(results: Results) -> str:
-    """A row a run that is told nothing: success with its own demonstration, with another task's."""
-    rows = [["run", "own demonstration alone", "another's demonstration alone"]]
-    for variant, title in VARIANTS.items():
-        for run in runs_of(results, variant):
-            if "swap" in run:
-                cells = [pooled_success(measured(run, Column("swap", place))) for place in (0, 1)]
-                rows.append([f"{title}, seed {run['training']['arguments']['seed']}", *cells])
     return format_table(rows)
 
 
@@ -736,14 +699,11 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "rl": rl_table,
     "base": lambda results: by_task_table(results, "base", "ml10"),
     "novel": lambda results: by_task_table(results, "novel", "ml10"),
-    "old variants": variants_table,
-    "old swap": swap_table,
-    "old reading": reading_table,
+    "swap": swap_table,
+    "old variants": old_variants_table,
     "old policies": policies_table,
-    "old ablation": ablation_table,
     "old ml45 means": lambda results: means_table(results, "old-ml45"),
     "old ml45 difficulty": lambda results: difficulty_table(results, "old-ml45"),
-    "old ml45 novel": lambda results: by_task_table(results, "novel", "old-ml45"),
     "old length": length_table,
     "old limits": lambda results: limits_table(results, LIMITS, "given"),
     "old tuning": lambda results: limits_table(results, TUNING, "trained"),
@@ -770,7 +730,7 @@ def plot_swap(results: Results, path: Path) -> None:
 
     policies = {title: columns for title, columns in swaps(results).items() if columns}
     labels = list(max(policies.values(), key=len))
-    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
     panels = figure.subplots(1, len(policies), sharey=True)
     own_color, other_color = "C0", "C3"
     for axes, (title, columns) in zip(panels, policies.items()):
@@ -794,65 +754,7 @@ def plot_swap(results: Results, path: Path) -> None:
         ),
     ]
     figure.legend(handles=legend, ncols=2, loc="outside lower center", frameon=False, fontsize=8)
-    figure.suptitle("ML10's base tasks, three single trainings of an older recipe", fontsize=10)
-    save_png(figure, path, dpi=120)
-
-
-GRADIENT_STEPS = {  # with ten demonstrations -> where that was measured
-    0: Column("curve", "before"),
-    1: Column("curve", "1 steps"),
-    5: Column("curve", "5 steps"),
-    20: Column("curve", "20 steps"),
-    50: Column("curve", "50 steps"),
-    200: Column("curve", "after"),
-    500: Column("long", "500 steps"),
-    1000: Column("long", "after"),
-}
-DEMONSTRATIONS = {  # with 200 gradient steps -> where that was measured
-    1: Column("1-shot", "after"),
-    3: Column("3-shot", "after"),
-    5: Column("5-shot", "after"),
-    10: Column("curve", "after"),
-}
-
-
-def plot_adaptation(results: Results, path: Path) -> None:
-    """Writes a chart of success on novel tasks along gradient steps, and along demonstrations."""
-    from matplotlib.figure import Figure
-
-    panels = {
-        "gradient steps, ten demonstrations": GRADIENT_STEPS,
-        "demonstrations, 200 gradient steps": DEMONSTRATIONS,
-    }
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
-    for axes, (label, columns) in zip(figure.subplots(1, 2, sharey=True), panels.items()):
-        for variant, title in VARIANTS.items():
-            episodes = {x: together(results, variant, column) for x, column in columns.items()}
-            episodes = {x: of_column for x, of_column in episodes.items() if of_column}
-            if not episodes:
-                continue
-            bounds = [wilson_interval(sum(e), len(e)) for e in episodes.values()]
-            rates = np.array([np.mean(e) for e in episodes.values()])
-            axes.errorbar(
-                list(episodes),
-                100 * rates,
-                yerr=100 * np.abs(np.array(bounds).T - rates),  # (2, points)
-                label=SHOWN["old-ml10"].get(variant, title),
-                marker="o",
-                markersize=4,
-                capsize=2,
-                linewidth=1.5,
-            )
-        axes.set_xscale("symlog", linthresh=1)
-        axes.set_xticks(list(columns), list(columns), fontsize=7)
-        axes.minorticks_off()
-        axes.set(xlabel=label, ylim=(0, 100))
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].set_ylabel("success at any step, %")
-    title = "ML10's novel tasks, an older recipe: one training each, 100 episodes a point"
-    figure.suptitle(title, fontsize=10)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, ncols=2, loc="outside lower center", fontsize=8)
+    figure.suptitle("ML10's base tasks: one training a panel, 200 episodes a bar", fontsize=10)
     save_png(figure, path, dpi=120)
 
 
@@ -1032,7 +934,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     plot_swap(results, ROOT / "assets" / "swap.png")
     plot_by_task(results, ROOT / "assets" / "success.png")
     plot_steps(results, "reach", ROOT / "assets" / "inner-steps.png")
-    plot_adaptation(results, ROOT / "assets" / "adaptation.png")
 
 
 if __name__ == "__main__":
