@@ -373,7 +373,8 @@ def old_variants_table(results: Results) -> str:
     """A row a variant of ML10, by the older recipe."""
     rows = [["ML10", "base", "novel, no gradient step", "novel, 200 steps"]]
     for variant, title in OLD_VARIANTS.items():
-        rows.append([title, *(mean(results, variant, column) for column in (BASE, BEFORE, AFTER))])
+        cells = [mean(results, variant, column) for column in (BASE, BEFORE, AFTER)]
+        rows.append([title, *cells])
     return format_table(rows)
 
 
@@ -431,6 +432,32 @@ def pairs(one: Successes, other: Successes) -> list[tuple[bool, bool]]:
     return [pair for task in one for pair in zip(one[task], other[task])]
 
 
+def won_and_lost(one: Successes, other: Successes) -> tuple[int, int]:
+    """How many episodes a policy wins against another on the same goals, and how many it loses."""
+    outcomes = pairs(one, other)
+    return outcomes.count((True, False)), outcomes.count((False, True))
+
+
+COMPARED_WITH = "ml10-neither"  # of ML10, multi-task training
+
+
+def against_multi_task_table(results: Results) -> str:
+    """A row a training of ML10: won and lost against multi-task training of the same seed."""
+    rows = [["against multi-task training", "base tasks: won, lost", "novel tasks: won, lost"]]
+    for variant, title in variants_of(results, "ml10").items():
+        for seed in range(3):
+            ours = results.get(f"{variant}-seed{seed}")
+            theirs = results.get(f"{COMPARED_WITH}-seed{seed}")
+            if variant == COMPARED_WITH or ours is None or theirs is None:
+                continue
+            cells = []
+            for column in MEASURED_BY.values():
+                won, lost = won_and_lost(measured(ours, column), measured(theirs, column))
+                cells.append(f"{won}, {lost}")
+            rows.append([f"{title}, seed {seed}", *cells])
+    return format_table(rows)
+
+
 def limits_table(results: Results, titles: dict[str, str], first: str) -> str:
     """A row a variant of `titles`, seed 0 of each, beside the first of them.
 
@@ -445,9 +472,8 @@ def limits_table(results: Results, titles: dict[str, str], first: str) -> str:
     for variant, of_variant in successes.items():
         if of_variant is None:
             continue
-        outcomes = pairs(of_variant, plain)
-        counts = f"{outcomes.count((True, False))}, {outcomes.count((False, True))}"
-        against = "" if of_variant is plain else counts
+        won, lost = won_and_lost(of_variant, plain)
+        against = "" if of_variant is plain else f"{won}, {lost}"
         rows.append([titles[variant], pooled_success(of_variant), against])
     return format_table(rows)
 
@@ -463,13 +489,10 @@ SWAP_COLUMNS = {  # what a policy is shown -> where that was measured
 
 def swaps(results: Results) -> dict[str, dict[str, Successes]]:
     """Policy -> what it is shown -> its episodes on the base tasks."""
-    policies = {}
-    for name, title in SWAPPED.items():
-        columns = {
-            label: measured(results.get(name, {}), column) for label, column in SWAP_COLUMNS.items()
-        }
-        policies[title] = {label: x for label, x in columns.items() if x is not None}
-    return policies
+    return {
+        title: {label: measured(results[name], column) for label, column in SWAP_COLUMNS.items()}
+        for name, title in SWAPPED.items()
+    }
 
 
 def swap_table(results: Results) -> str:
@@ -477,9 +500,8 @@ def swap_table(results: Results) -> str:
     policies = swaps(results)
     rows = [["what the policy sees", *policies]]
     for label in SWAP_COLUMNS:
-        if any(label in columns for columns in policies.values()):
-            cells = [pooled_success(c[label]) if label in c else "" for c in policies.values()]
-            rows.append([label, *cells])
+        cells = [pooled_success(columns[label]) for columns in policies.values()]
+        rows.append([label, *cells])
     return format_table(rows)
 
 
@@ -699,6 +721,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "rl": rl_table,
     "base": lambda results: by_task_table(results, "base", "ml10"),
     "novel": lambda results: by_task_table(results, "novel", "ml10"),
+    "against multi-task": against_multi_task_table,
     "swap": swap_table,
     "old variants": old_variants_table,
     "old policies": policies_table,
@@ -728,16 +751,13 @@ def plot_swap(results: Results, path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    policies = {title: columns for title, columns in swaps(results).items() if columns}
-    labels = list(max(policies.values(), key=len))
+    policies = swaps(results)
+    labels = list(SWAP_COLUMNS)
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     panels = figure.subplots(1, len(policies), sharey=True)
     own_color, other_color = "C0", "C3"
     for axes, (title, columns) in zip(panels, policies.items()):
         for place, label in enumerate(labels):
-            if label not in columns:
-                axes.text(3, place, "not measured", va="center", fontsize=8)
-                continue
             episodes = [success for of_task in columns[label].values() for success in of_task]
             rate, bounds = np.mean(episodes), wilson_interval(sum(episodes), len(episodes))
             error = 100 * np.abs(np.array(bounds)[:, None] - rate)  # (2, 1)
@@ -873,12 +893,12 @@ def compare(results: Results, one: str, other: str) -> str:
             theirs = episodes_of(results.get(name.replace(one, other, 1), {}), report)
             if not ours or not theirs:
                 continue
-            outcomes = pairs(ours, theirs)
-            won, lost = outcomes.count((True, False)), outcomes.count((False, True))
-            difference = 100 * (won - lost) / len(outcomes)
+            won, lost = won_and_lost(ours, theirs)
+            number = len(pairs(ours, theirs))
+            difference = 100 * (won - lost) / number
             p = binomtest(won, won + lost).pvalue if won + lost else 1.0
             seed = name.rpartition("-seed")[2]
-            cells = [seed, won, lost, len(outcomes), f"{difference:+.1f}", f"{p:.4f}"]
+            cells = [seed, won, lost, number, f"{difference:+.1f}", f"{p:.4f}"]
             rows.append([report, *map(str, cells)])
             differences.append(difference)
         if len(differences) > 1:

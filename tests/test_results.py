@@ -110,8 +110,10 @@ def test_a_comparison_counts_what_is_won_and_lost_on_the_same_goals():
     results = {"a-seed0": run("1100", "1111111"), "b-seed0": run("1011", "0000001")}
     for name, more in {"a-seed0": "111", "b-seed0": "101"}.items():
         results[name]["base-goals2"] = {"successes": {"last": {"reach": more}}}
-    results |= {"a-seed1": run("1111", "1111111"), "b-seed1": run("1110", "1111111")}
-    results |= {"a-seed2": run("1111", "1111111"), "b-seed3": run("0000", "0000000")}  # no pairs
+    results["a-seed1"] = run("1111", "1111111")
+    results["b-seed1"] = run("1110", "1111111")
+    results["a-seed2"] = run("1111", "1111111")  # these two make no pair
+    results["b-seed3"] = run("0000", "0000000")
     rows = [line.split("|")[1:-1] for line in compare(results, "a", "b").splitlines()[2:]]
     rows = [[cell.strip() for cell in row] for row in rows]
     assert rows == [
